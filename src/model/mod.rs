@@ -1,0 +1,13 @@
+//! What flows: the values that pass from stage to stage. No behaviour beyond their own geometry and storage.
+
+pub mod belief;
+
+pub mod camera;
+
+pub mod frame;
+
+pub mod pose;
+
+pub mod report;
+
+pub mod viewpoint;
