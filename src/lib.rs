@@ -1,1 +1,11 @@
+pub mod config;
 
+pub mod pipeline;
+
+pub mod stages;
+
+pub mod engine;
+
+pub mod memory;
+
+pub mod model;

@@ -54,6 +54,10 @@ pub enum FrameError {
     #[error("the depth has {got} pixels but the image {expected}: register the depth to the image")]
     DepthSize { got: usize, expected: usize },
     #[error(
+        "only {valid_percent:.2} % of the pixels have depth: nothing could be remembered; is the depth camera covered or off?"
+    )]
+    NoDepth { valid_percent: f64 },
+    #[error(
         "only {valid_percent:.1} % of the depth is between {min_m} m and {max_m} m (median of what is there: {median_m:.4} m): is its unit right? 16UC1 counts millimetres, 32FC1 metres"
     )]
     DepthUnit {
@@ -70,6 +74,7 @@ impl FrameError {
         match self {
             Self::ImageSize { .. } => "image_size",
             Self::DepthSize { .. } => "depth_size",
+            Self::NoDepth { .. } => "no_depth",
             Self::DepthUnit { .. } => "depth_unit",
         }
     }

@@ -18,7 +18,11 @@ pub struct PoseNoise {
 /// Pose from a position (metres) and a quaternion `[x, y, z, w]`; `None` if anything is not finite or the
 /// quaternion's length is not 1 (to 0.001), in which case it carries no trustworthy rotation.
 pub fn pose_from_parts(position: [f64; 3], quaternion_xyzw: [f64; 4]) -> Option<Pose> {
-    if !position.iter().chain(&quaternion_xyzw).all(|value| value.is_finite()) {
+    if !position
+        .iter()
+        .chain(&quaternion_xyzw)
+        .all(|value| value.is_finite())
+    {
         return None;
     }
     let [x, y, z, w] = quaternion_xyzw;

@@ -57,6 +57,71 @@ impl Mesh {
             row_depth_m,
         }
     }
+
+    fn bytes(&self) -> usize {
+        size_of_val(self.depth_m.as_slice())
+            + size_of_val(self.cut.as_slice())
+            + size_of_val(self.row_depth_m.as_slice())
+    }
+}
+
+/// A viewpoint's luminance at half resolution: what poses are refined against. Follows from mesh and records.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Coarse {
+    pub mesh: Mesh,
+    /// Expected Y, a value a pixel of the mesh.
+    pub luminance: Vec<f32>,
+    /// Predictive variance of Y: beta/alpha * (1 + sigma), squared grey levels.
+    pub variance: Vec<f32>,
+}
+
+/// How many pixels of 2x2 must have depth, on one surface, for their mean to have it.
+const COARSE_DEPTHS_MIN: usize = 3;
+
+impl Coarse {
+    /// Means over 2x2 pixels; `cut` as for [`Mesh::new`].
+    pub fn new(mesh: &Mesh, records: &[Record], cut: f32) -> Self {
+        let fine = mesh.intrinsics;
+        let coarse = fine.half();
+        let mut depth_m = Vec::with_capacity(coarse.pixels());
+        let mut luminance = Vec::with_capacity(coarse.pixels());
+        let mut variance = Vec::with_capacity(coarse.pixels());
+        for y in 0..coarse.height {
+            for x in 0..coarse.width {
+                let first = 2 * y * fine.width + 2 * x;
+                let four = [first, first + 1, first + fine.width, first + fine.width + 1];
+                depth_m.push(coarse_depth_m(four.map(|pixel| mesh.depth_m[pixel]), cut));
+                let mut sums = (0.0, 0.0);
+                for pixel in four {
+                    let belief = records[pixel].unpack();
+                    sums.0 += belief.tau[0];
+                    sums.1 += belief.beta[0] / belief.alpha * (1.0 + belief.sigma[0]);
+                }
+                luminance.push(sums.0 / 4.0);
+                variance.push(sums.1 / 4.0);
+            }
+        }
+        Self {
+            mesh: Mesh::new(coarse, depth_m, cut),
+            luminance,
+            variance,
+        }
+    }
+}
+
+/// Mean of the depths that are there; 0 where they are too few or not on one surface.
+fn coarse_depth_m(four: [f32; 4], cut: f32) -> f32 {
+    let (mut count, mut sum, mut low, mut high) = (0, 0.0, f32::INFINITY, 0.0f32);
+    for z in four.into_iter().filter(|z| *z > 0.0) {
+        count += 1;
+        sum += z;
+        (low, high) = (low.min(z), high.max(z));
+    }
+    if count >= COARSE_DEPTHS_MIN && high - low <= cut * low {
+        sum / count as f32
+    } else {
+        0.0
+    }
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -68,6 +133,7 @@ pub struct Viewpoint {
     pub mesh: Mesh,
     /// One a pixel.
     pub records: Vec<Record>,
+    pub coarse: Coarse,
     /// Who wrote it last, and when (capture time).
     pub source: Source,
     pub stamp_ns: i64,
@@ -80,8 +146,9 @@ impl Viewpoint {
     pub fn bytes(&self) -> usize {
         size_of::<Self>()
             + size_of_val(self.records.as_slice())
-            + size_of_val(self.mesh.depth_m.as_slice())
-            + size_of_val(self.mesh.cut.as_slice())
-            + size_of_val(self.mesh.row_depth_m.as_slice())
+            + self.mesh.bytes()
+            + self.coarse.mesh.bytes()
+            + size_of_val(self.coarse.luminance.as_slice())
+            + size_of_val(self.coarse.variance.as_slice())
     }
 }

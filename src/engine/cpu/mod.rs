@@ -1,0 +1,240 @@
+//! The engine on the processor: passes over strips of rows, shared out among the threads of one pool.
+
+mod score;
+
+mod strips;
+
+use std::sync::{Arc, Mutex};
+
+use rayon::ThreadPool;
+
+use crate::{
+    config::Settings,
+    engine::isa::Isa,
+    model::{
+        belief::{CHANNELS, Record, ycbcr_from_rgb},
+        camera::Intrinsics,
+        frame::RgbImage,
+        pose::Pose,
+        viewpoint::Viewpoint,
+    },
+    stages::{
+        exposure::exposure_gain,
+        interpolate::{
+            merge::{MergeRules, MergeView},
+            prior::{self, Prior},
+            project::Projector,
+        },
+        surprise::GammaTerm,
+        update::UpdateRules,
+    },
+};
+
+use score::{ScoreRules, ScoreScratch};
+use strips::StripScratch;
+
+/// Rows of a strip: its maps of seven views of 640 pixels stay within 600 KB, a core's second-level cache.
+const STRIP_ROWS: usize = 16;
+
+/// A viewpoint to recall from.
+#[derive(Clone, Copy)]
+pub struct RecallView<'a> {
+    pub viewpoint: &'a Viewpoint,
+    /// In votes and means.
+    pub weight: f32,
+    /// Written during this visit.
+    pub fresh: bool,
+}
+
+/// Luminance and chrominance of a frame, a plane a channel.
+#[derive(Debug, Clone, Default)]
+pub struct Observation {
+    pub width: usize,
+    pub height: usize,
+    pub planes: [Vec<f32>; CHANNELS],
+}
+
+impl Observation {
+    pub fn new(image: &RgbImage) -> Self {
+        let pixels = image.width * image.height;
+        let mut planes: [Vec<f32>; CHANNELS] = std::array::from_fn(|_| Vec::with_capacity(pixels));
+        for rgb in image.data.chunks_exact(3) {
+            let ycbcr = ycbcr_from_rgb([f32::from(rgb[0]), f32::from(rgb[1]), f32::from(rgb[2])]);
+            for (plane, value) in planes.iter_mut().zip(ycbcr) {
+                plane.push(value);
+            }
+        }
+        Self {
+            width: image.width,
+            height: image.height,
+            planes,
+        }
+    }
+
+    fn row(&self, y: usize) -> [&[f32]; CHANNELS] {
+        std::array::from_fn(|channel| &self.planes[channel][y * self.width..][..self.width])
+    }
+}
+
+/// What a frame did to the prior.
+#[derive(Debug, Clone, Default)]
+pub struct Score {
+    /// Nats a pixel; 0 where unseen.
+    pub surprise: Vec<f32>,
+    /// The posterior, a record a pixel.
+    pub posterior: Vec<Record>,
+    /// The exposure gain the observation was divided by.
+    pub gain: f32,
+}
+
+pub struct CpuEngine {
+    pool: Arc<ThreadPool>,
+    isa: Isa,
+    merge_rules: MergeRules,
+    score_rules: ScoreRules,
+    exposure_gain: bool,
+    /// One a thread; never contended.
+    scratch: Vec<Mutex<(StripScratch, ScoreScratch)>>,
+}
+
+impl CpuEngine {
+    /// `pool` may be shared among engines.
+    pub fn new(settings: &Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+        let update = UpdateRules::new(settings);
+        let scratch = (0..pool.current_num_threads())
+            .map(|_| Mutex::default())
+            .collect();
+        Self {
+            pool,
+            isa,
+            merge_rules: MergeRules {
+                depth_vote_tolerance: settings.depth_vote.then_some(settings.depth_vote_tolerance),
+                colour_vote: settings.colour_vote,
+                view_variance: settings.view_variance,
+                earlier_appearance: settings.earlier_appearance,
+            },
+            score_rules: ScoreRules {
+                gamma: GammaTerm::new(&update),
+                update,
+                edge_variance_px: settings.edge_error_px * settings.edge_error_px,
+                earlier_appearance: settings.earlier_appearance,
+                surprise_threshold: settings.surprise_threshold,
+            },
+            exposure_gain: settings.exposure_gain,
+            scratch,
+        }
+    }
+
+    /// Interpolates the beliefs at a pose from at most 16 views into `prior`.
+    pub fn recall(
+        &self,
+        views: &[RecallView],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        prior: &mut Prior,
+    ) {
+        let projectors: Vec<Projector> = views
+            .iter()
+            .map(|view| {
+                Projector::new(
+                    &view.viewpoint.mesh,
+                    &view.viewpoint.world_from_camera,
+                    intrinsics,
+                    world_from_camera,
+                )
+            })
+            .collect();
+        let merge_views: Vec<MergeView> = views
+            .iter()
+            .map(|view| MergeView {
+                records: &view.viewpoint.records,
+                width: view.viewpoint.mesh.intrinsics.width,
+                height: view.viewpoint.mesh.intrinsics.height,
+                weight: view.weight,
+                fresh: view.fresh,
+            })
+            .collect();
+        prior.resize(intrinsics.width, intrinsics.height);
+        let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
+        self.pool.install(|| {
+            use rayon::prelude::*;
+            prior
+                .data
+                .par_chunks_mut(strip_values)
+                .enumerate()
+                .for_each(|(strip, rows)| {
+                    let (scratch, _) = &mut *self.thread_scratch();
+                    scratch.recall(
+                        self.isa,
+                        &projectors,
+                        &merge_views,
+                        self.merge_rules,
+                        intrinsics.width,
+                        strip * STRIP_ROWS,
+                        rows,
+                    );
+                });
+        });
+    }
+
+    /// Updates the prior with an observation of the same size and measures the surprise.
+    pub fn score(&self, prior: &Prior, observation: &Observation, score: &mut Score) {
+        let (width, height) = (prior.width, prior.height);
+        assert_eq!(
+            (observation.width, observation.height),
+            (width, height),
+            "the prior is recalled for the frame's camera"
+        );
+        score.gain = if self.exposure_gain {
+            exposure_gain((0..height).map(|y| {
+                let row = prior.row(y);
+                (
+                    row.plane(prior::TAU),
+                    row.plane(prior::COVERAGE),
+                    observation.row(y)[0],
+                )
+            }))
+        } else {
+            1.0
+        };
+        score.surprise.resize(width * height, 0.0);
+        score.posterior.resize(width * height, Record::default());
+        let inverse_gain = 1.0 / score.gain;
+        let strip_pixels = STRIP_ROWS * width;
+        self.pool.install(|| {
+            use rayon::prelude::*;
+            score
+                .surprise
+                .par_chunks_mut(strip_pixels)
+                .zip(score.posterior.par_chunks_mut(strip_pixels))
+                .enumerate()
+                .for_each(|(strip, (surprise, posterior))| {
+                    let (_, scratch) = &mut *self.thread_scratch();
+                    let rows = surprise
+                        .chunks_exact_mut(width)
+                        .zip(posterior.chunks_exact_mut(width));
+                    for (row, (surprise, posterior)) in rows.enumerate() {
+                        let y = strip * STRIP_ROWS + row;
+                        score::score_row(
+                            self.isa,
+                            prior,
+                            y,
+                            observation.row(y),
+                            inverse_gain,
+                            &self.score_rules,
+                            scratch,
+                            surprise,
+                            posterior,
+                        );
+                    }
+                });
+        });
+    }
+
+    fn thread_scratch(&self) -> std::sync::MutexGuard<'_, (StripScratch, ScoreScratch)> {
+        let thread = rayon::current_thread_index().expect("runs inside the pool");
+        self.scratch[thread]
+            .lock()
+            .expect("a thread that panicked ends the process")
+    }
+}

@@ -1,0 +1,89 @@
+//! The recall passes over one strip of rows: every view's mesh is drawn into a map, then the rows are merged.
+
+use crate::{
+    engine::isa::{Isa, for_each_isa},
+    stages::interpolate::{
+        merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
+        prior::PLANES,
+        project::{ProjectScratch, Projector, Sample},
+    },
+};
+
+for_each_isa! {
+    fn draw(
+        projector: &Projector<'_>,
+        width: usize,
+        rows: std::ops::Range<usize>,
+        map: &mut [Sample],
+        scratch: &mut ProjectScratch,
+    ) = draw_kernel;
+}
+
+for_each_isa! {
+    fn merge(
+        views: &[MergeView<'_>],
+        maps: &[&[Sample]],
+        rules: MergeRules,
+        width: usize,
+        row: &mut [f32],
+    ) = merge_row;
+}
+
+#[inline(always)]
+fn draw_kernel(
+    projector: &Projector<'_>,
+    width: usize,
+    rows: std::ops::Range<usize>,
+    map: &mut [Sample],
+    scratch: &mut ProjectScratch,
+) {
+    projector.draw(width, rows, map, scratch);
+}
+
+/// Working memory of one thread.
+#[derive(Default)]
+pub struct StripScratch {
+    /// One map a view.
+    maps: Vec<Sample>,
+    project: ProjectScratch,
+}
+
+impl StripScratch {
+    /// Rows from `first_row` on, as many as `rows` holds.
+    #[allow(clippy::too_many_arguments)]
+    pub fn recall(
+        &mut self,
+        isa: Isa,
+        projectors: &[Projector],
+        views: &[MergeView],
+        rules: MergeRules,
+        width: usize,
+        first_row: usize,
+        rows: &mut [f32],
+    ) {
+        let height = rows.len() / (width * PLANES);
+        let map_size = width * height;
+        self.maps.clear();
+        self.maps.resize(map_size * views.len(), 0);
+        if map_size == 0 {
+            return;
+        }
+        for (projector, map) in projectors.iter().zip(self.maps.chunks_exact_mut(map_size)) {
+            draw(
+                isa,
+                projector,
+                width,
+                first_row..first_row + height,
+                map,
+                &mut self.project,
+            );
+        }
+        for (y, row) in rows.chunks_exact_mut(width * PLANES).enumerate() {
+            let mut maps: [&[Sample]; VIEWS_MAX] = [&[]; VIEWS_MAX];
+            for (slot, map) in maps.iter_mut().zip(self.maps.chunks_exact(map_size)) {
+                *slot = &map[y * width..][..width];
+            }
+            merge(isa, views, &maps[..views.len()], rules, width, row);
+        }
+    }
+}

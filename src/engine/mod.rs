@@ -1,0 +1,5 @@
+//! Where interpolation and surprise are computed.
+
+pub mod isa;
+
+pub mod cpu;

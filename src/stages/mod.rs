@@ -1,0 +1,17 @@
+//! What is computed, in the order of a frame's way. Plain functions over values and rows; they know `model` alone.
+
+pub mod select;
+
+pub mod refine;
+
+pub mod interpolate;
+
+pub mod exposure;
+
+pub mod update;
+
+pub mod surprise;
+
+pub mod lanes;
+
+pub mod attend;

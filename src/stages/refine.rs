@@ -1,0 +1,570 @@
+//! Corrects a given pose against the image that the memory expects there (step 1 of the robust preset).
+//!
+//! Nearest viewpoints at half resolution, observed luminance, pose and its noise -> the refined pose. Inverse
+//! compositional Gauss-Newton from coarse to fine over a rigid motion, a gain and an offset, with Tukey weights scaled by
+//! the predicted variance and a prior from the stated noise. Pose error is the root of false alarms at edges; the paper
+//! takes poses as given.
+
+use nalgebra::{Isometry3, SMatrix, SVector, Translation3, UnitQuaternion, Vector3};
+
+use crate::{
+    model::{
+        camera::Intrinsics,
+        pose::{Pose, PoseNoise},
+        viewpoint::Coarse,
+    },
+    stages::interpolate::project::{
+        ProjectScratch, Projector, Sample, sample_depth_m, sample_position,
+    },
+};
+
+/// Three views predict as well as seven, at less than half the cost.
+pub const REFINE_VIEWS: usize = 3;
+
+/// Less noise than this is not believed: it would tie refinement to a tracker's own errors.
+const POSITION_SD_MIN_M: f64 = 0.002;
+const ROTATION_SD_MIN_RAD: f64 = 0.2 * std::f64::consts::PI / 180.0;
+/// Prior of the gain around 1 and of the offset around 0, grey levels.
+const GAIN_SD: f64 = 0.2;
+const OFFSET_SD: f64 = 10.0;
+/// Errors are correlated from pixel to pixel: so many pixels of a 320x240 image count as one. With 25 instead of 1600
+/// the memory's poses drift by 20 mm along a pass.
+const CORRELATED_PIXELS: f64 = 1600.0;
+const CORRELATED_PIXELS_OF: f64 = 320.0 * 240.0;
+/// Variance of the sensor on top of what the belief predicts, squared grey levels.
+const SENSOR_VARIANCE: f32 = 9.0;
+/// Tukey's constant: 95 % efficiency for normal errors.
+const TUKEY: f32 = 4.685;
+/// Bounds of the residuals' scale, in predicted standard deviations.
+const SCALE_MIN: f32 = 0.1;
+const SCALE_MAX: f32 = 3.0;
+const ITERATIONS: usize = 4;
+/// A correction beyond this many standard deviations of the stated noise is refused. 6 makes frames flash.
+const CORRECTION_SD_MAX: f64 = 20.0;
+/// Where a residual stops counting in the test whether refinement helped, predicted standard deviations.
+const RESIDUAL_CAP: f32 = 4.0;
+/// Fewer comparable pixels on a level say nothing about a pose.
+const PIXELS_MIN: usize = 200;
+/// Expected pose error, pixels of the full image, from which a third and a fourth level are needed to catch it.
+const THIRD_LEVEL_PX: f64 = 2.5;
+const FOURTH_LEVEL_PX: f64 = 4.0;
+/// Views whose depth differs by more than this share from the middle one do not predict a pixel.
+const DEPTH_TOLERANCE: f32 = 0.03;
+
+type Vector8 = SVector<f64, 8>;
+type Matrix8 = SMatrix<f64, 8, 8>;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Refined {
+    pub world_from_camera: Pose,
+    pub correction_m: f64,
+    pub correction_rad: f64,
+}
+
+impl Refined {
+    pub fn unchanged(world_from_camera: Pose) -> Self {
+        Self {
+            world_from_camera,
+            correction_m: 0.0,
+            correction_rad: 0.0,
+        }
+    }
+}
+
+/// Luminance, variance and depth that the memory predicts, or what was observed, at one resolution.
+#[derive(Default)]
+struct Level {
+    width: usize,
+    height: usize,
+    /// Predicted Y; the depth is 0 where nothing is predicted.
+    luminance: Vec<f32>,
+    variance: Vec<f32>,
+    depth_m: Vec<f32>,
+    observed: Vec<f32>,
+}
+
+/// A comparable pixel: everything about it that does not change while the pose does.
+struct Point {
+    in_camera: [f32; 3],
+    /// d tau / d (translation, rotation) of the template, without the gain.
+    jacobian: [f32; 6],
+    luminance: f32,
+    inverse_sd: f32,
+}
+
+/// What is estimated: the real camera is `given * camera_from_real`, and Y = gain * tau + offset.
+#[derive(Clone, Copy)]
+struct Estimate {
+    given_from_real: Isometry3<f64>,
+    gain: f64,
+    offset: f64,
+}
+
+/// Keeps its working memory between frames.
+#[derive(Default)]
+pub struct PoseRefiner {
+    maps: Vec<Sample>,
+    scratch: ProjectScratch,
+    residuals: Vec<f32>,
+    magnitudes: Vec<f32>,
+    points: Vec<Point>,
+}
+
+impl PoseRefiner {
+    /// `views` are nearest first with their weight in means; `observed` is the luminance of the full image. Returns the
+    /// given pose where refinement does not help.
+    pub fn refine(
+        &mut self,
+        views: &[(&Coarse, &Pose, f32)],
+        observed: &[f32],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        noise: PoseNoise,
+    ) -> Refined {
+        let unchanged = Refined::unchanged(*world_from_camera);
+        let noise = PoseNoise {
+            position_m: noise.position_m.max(POSITION_SD_MIN_M),
+            rotation_rad: noise.rotation_rad.max(ROTATION_SD_MIN_RAD),
+        };
+        let half = intrinsics.half();
+        let mut finest = self.predict(views, &half, world_from_camera);
+        finest.observed = halved(observed, intrinsics.width, intrinsics.height);
+        let Some(levels) = level_count(&finest, intrinsics, noise) else {
+            return unchanged;
+        };
+        let mut pyramid = vec![(half, finest)];
+        while pyramid.len() < levels {
+            let (camera, level) = &pyramid[pyramid.len() - 1];
+            let coarser = (camera.half(), level.halved());
+            pyramid.push(coarser);
+        }
+
+        let start = Estimate {
+            given_from_real: Isometry3::identity(),
+            gain: 1.0,
+            offset: 0.0,
+        };
+        let mut estimate = start;
+        let mut improved = false;
+        for (index, (camera, level)) in pyramid.iter().enumerate().rev() {
+            collect_points(level, camera, &mut self.points);
+            if self.points.len() < PIXELS_MIN {
+                continue;
+            }
+            // The finest level is half the image, so level 1.
+            let scale = intrinsics.pixels() as f64 / CORRELATED_PIXELS_OF;
+            let discount = (CORRELATED_PIXELS * scale / 4f64.powi(index as i32 + 1)).max(1.0);
+            for _ in 0..ITERATIONS {
+                let Some(next) = self.step(&estimate, level, camera, noise, discount) else {
+                    break;
+                };
+                estimate = next;
+            }
+            if index == 0 {
+                improved =
+                    self.mismatch(&estimate, level, camera) < self.mismatch(&start, level, camera);
+            }
+        }
+        let motion = logarithm(&estimate.given_from_real);
+        let in_bounds = (0..6).all(|axis| {
+            let sd = if axis < 3 {
+                noise.position_m
+            } else {
+                noise.rotation_rad
+            };
+            motion[axis].abs() < CORRECTION_SD_MAX * sd
+        });
+        if !improved || !in_bounds {
+            return unchanged;
+        }
+        Refined {
+            world_from_camera: world_from_camera * estimate.given_from_real,
+            correction_m: estimate.given_from_real.translation.vector.norm(),
+            correction_rad: estimate.given_from_real.rotation.angle(),
+        }
+    }
+
+    /// The views' luminance, variance and depth at the given pose.
+    fn predict(
+        &mut self,
+        views: &[(&Coarse, &Pose, f32)],
+        camera: &Intrinsics,
+        world_from_camera: &Pose,
+    ) -> Level {
+        let pixels = camera.pixels();
+        let views = &views[..views.len().min(REFINE_VIEWS)];
+        self.maps.clear();
+        self.maps.resize(pixels * REFINE_VIEWS, 0);
+        for ((coarse, world_from_view, _), map) in
+            views.iter().zip(self.maps.chunks_exact_mut(pixels.max(1)))
+        {
+            Projector::new(&coarse.mesh, world_from_view, camera, world_from_camera).draw(
+                camera.width,
+                0..camera.height,
+                map,
+                &mut self.scratch,
+            );
+        }
+        let mut level = Level {
+            width: camera.width,
+            height: camera.height,
+            luminance: vec![0.0; pixels],
+            variance: vec![0.0; pixels],
+            depth_m: vec![0.0; pixels],
+            observed: Vec::new(),
+        };
+        for pixel in 0..pixels {
+            let mut seen = [(0.0f32, 0.0f32, 0.0f32, 0.0f32); REFINE_VIEWS];
+            let mut count = 0;
+            for (view, (coarse, _, weight)) in views.iter().enumerate() {
+                let sample = self.maps[view * pixels + pixel];
+                if sample != 0 {
+                    let (luminance, variance) = interpolate(coarse, sample);
+                    seen[count] = (sample_depth_m(sample), luminance, variance, *weight);
+                    count += 1;
+                }
+            }
+            if count > 0 {
+                let (luminance, variance, depth_m) = merge(&mut seen[..count]);
+                level.luminance[pixel] = luminance;
+                level.variance[pixel] = variance;
+                level.depth_m[pixel] = depth_m;
+            }
+        }
+        level
+    }
+
+    /// One Gauss-Newton step; `None` when too little of the view is left.
+    fn step(
+        &mut self,
+        estimate: &Estimate,
+        level: &Level,
+        camera: &Intrinsics,
+        noise: PoseNoise,
+        discount: f64,
+    ) -> Option<Estimate> {
+        let compared = self.compute_residuals(estimate, level, camera);
+        if compared < PIXELS_MIN {
+            return None;
+        }
+        let scale = self.residual_scale();
+        let cutoff = TUKEY * scale;
+        let mut hessian = [0.0f32; 36];
+        let mut gradient = [0.0f32; 8];
+        let mut hessian_sum = [0.0f64; 36];
+        let mut gradient_sum = [0.0f64; 8];
+        let gain = estimate.gain as f32;
+        for (points, residuals) in self.points.chunks(256).zip(self.residuals.chunks(256)) {
+            for (point, &residual) in points.iter().zip(residuals) {
+                // In predicted standard deviations; NaN left the image.
+                let normalised = residual * point.inverse_sd;
+                if residual.is_nan() || normalised.abs() >= cutoff {
+                    continue;
+                }
+                let tukey = 1.0 - (normalised / cutoff) * (normalised / cutoff);
+                let weight = tukey * tukey * point.inverse_sd * point.inverse_sd / (scale * scale);
+                let mut j = [0.0f32; 8];
+                for (j, jacobian) in j.iter_mut().zip(point.jacobian) {
+                    *j = gain * jacobian;
+                }
+                j[6] = point.luminance;
+                j[7] = 1.0;
+                let mut entry = 0;
+                for row in 0..8 {
+                    let weighted = weight * j[row];
+                    gradient[row] += weighted * residual;
+                    for value in &j[row..] {
+                        hessian[entry] += weighted * value;
+                        entry += 1;
+                    }
+                }
+            }
+            // Single precision within a chunk, double across: the sums keep their digits.
+            for (sum, part) in hessian_sum.iter_mut().zip(&mut hessian) {
+                *sum += f64::from(std::mem::take(part));
+            }
+            for (sum, part) in gradient_sum.iter_mut().zip(&mut gradient) {
+                *sum += f64::from(std::mem::take(part));
+            }
+        }
+        let mut normal = Matrix8::zeros();
+        let mut entry = 0;
+        for row in 0..8 {
+            for column in row..8 {
+                normal[(row, column)] = hessian_sum[entry] / discount;
+                normal[(column, row)] = normal[(row, column)];
+                entry += 1;
+            }
+        }
+        let mut right = Vector8::from_column_slice(&gradient_sum) / discount;
+        let motion = logarithm(&estimate.given_from_real);
+        for axis in 0..8 {
+            let (sd, deviation) = match axis {
+                0..3 => (noise.position_m, motion[axis]),
+                3..6 => (noise.rotation_rad, motion[axis]),
+                6 => (GAIN_SD, estimate.gain - 1.0),
+                _ => (OFFSET_SD, estimate.offset),
+            };
+            let precision = 1.0 / (sd * sd);
+            normal[(axis, axis)] += precision;
+            right[axis] -= precision * deviation;
+        }
+        let d = normal.cholesky()?.solve(&right);
+        // The template moved by d: the real camera sees its point X at (exp(d) E)^-1 X.
+        Some(Estimate {
+            given_from_real: exponential(&d) * estimate.given_from_real,
+            gain: estimate.gain + d[6],
+            offset: estimate.offset + d[7],
+        })
+    }
+
+    /// Y(pi(M X)) - gain * tau - offset for every point, NaN where that leaves the image; returns how many do not.
+    fn compute_residuals(
+        &mut self,
+        estimate: &Estimate,
+        level: &Level,
+        camera: &Intrinsics,
+    ) -> usize {
+        let real_from_given = estimate.given_from_real.inverse();
+        let rotation = real_from_given
+            .rotation
+            .to_rotation_matrix()
+            .matrix()
+            .cast::<f32>();
+        let translation = real_from_given.translation.vector.cast::<f32>();
+        let (gain, offset) = (estimate.gain as f32, estimate.offset as f32);
+        let (fx, fy) = (camera.fx as f32, camera.fy as f32);
+        let (cx, cy) = (camera.cx as f32, camera.cy as f32);
+        let (right, bottom) = ((level.width - 1) as f32, (level.height - 1) as f32);
+        self.residuals.clear();
+        let mut compared = 0;
+        for point in &self.points {
+            let q = rotation * Vector3::from(point.in_camera) + translation;
+            let u = fx * q.x / q.z + cx;
+            let v = fy * q.y / q.z + cy;
+            let residual = if q.z > 0.0 && u >= 0.0 && v >= 0.0 && u < right && v < bottom {
+                compared += 1;
+                let (x, y) = (u as usize, v as usize);
+                let (right, down) = (u - x as f32, v - y as f32);
+                let at = y * level.width + x;
+                let upper = level.observed[at] * (1.0 - right) + level.observed[at + 1] * right;
+                let at = at + level.width;
+                let lower = level.observed[at] * (1.0 - right) + level.observed[at + 1] * right;
+                upper * (1.0 - down) + lower * down - gain * point.luminance - offset
+            } else {
+                f32::NAN
+            };
+            self.residuals.push(residual);
+        }
+        compared
+    }
+
+    /// 1.4826 times the median of the residuals' magnitude in predicted standard deviations.
+    fn residual_scale(&mut self) -> f32 {
+        self.magnitudes.clear();
+        self.magnitudes.extend(
+            self.residuals
+                .iter()
+                .zip(&self.points)
+                .filter(|(residual, _)| !residual.is_nan())
+                .map(|(residual, point)| residual.abs() * point.inverse_sd),
+        );
+        let middle = self.magnitudes.len() / 2;
+        let (_, &mut median, _) = self
+            .magnitudes
+            .select_nth_unstable_by(middle, f32::total_cmp);
+        (1.4826 * median).clamp(SCALE_MIN, SCALE_MAX)
+    }
+
+    /// Mean capped residual, predicted standard deviations.
+    fn mismatch(&mut self, estimate: &Estimate, level: &Level, camera: &Intrinsics) -> f64 {
+        let compared = self.compute_residuals(estimate, level, camera);
+        let sum: f64 = self
+            .residuals
+            .iter()
+            .zip(&self.points)
+            .filter(|(residual, _)| !residual.is_nan())
+            .map(|(residual, point)| {
+                f64::from((residual.abs() * point.inverse_sd).min(RESIDUAL_CAP))
+            })
+            .sum();
+        if compared == 0 {
+            f64::INFINITY
+        } else {
+            sum / compared as f64
+        }
+    }
+}
+
+impl Level {
+    /// Means over 2x2; predicted where at least three of the four are.
+    fn halved(&self) -> Self {
+        let (width, height) = (self.width / 2, self.height / 2);
+        let mut level = Self {
+            width,
+            height,
+            luminance: Vec::with_capacity(width * height),
+            variance: Vec::with_capacity(width * height),
+            depth_m: Vec::with_capacity(width * height),
+            observed: halved(&self.observed, self.width, self.height),
+        };
+        for y in 0..height {
+            for x in 0..width {
+                let first = 2 * y * self.width + 2 * x;
+                let four = [first, first + 1, first + self.width, first + self.width + 1];
+                let (mut count, mut luminance, mut variance, mut depth_m) = (0.0, 0.0, 0.0, 0.0);
+                for pixel in four {
+                    if self.depth_m[pixel] > 0.0 {
+                        count += 1.0;
+                        luminance += self.luminance[pixel];
+                        variance += self.variance[pixel];
+                        depth_m += self.depth_m[pixel];
+                    }
+                }
+                let scale = if count >= 3.0 { 1.0 / count } else { 0.0 };
+                level.luminance.push(luminance * scale);
+                level.variance.push(variance * scale);
+                level.depth_m.push(depth_m * scale);
+            }
+        }
+        level
+    }
+}
+
+/// Means over 2x2; an odd last row or column is left out.
+fn halved(plane: &[f32], width: usize, height: usize) -> Vec<f32> {
+    let mut half = Vec::with_capacity((width / 2) * (height / 2));
+    for rows in plane.chunks_exact(2 * width).take(height / 2) {
+        let (upper, lower) = rows.split_at(width);
+        half.extend(
+            upper
+                .chunks_exact(2)
+                .zip(lower.chunks_exact(2))
+                .map(|(upper, lower)| (upper[0] + upper[1] + lower[0] + lower[1]) / 4.0),
+        );
+    }
+    half
+}
+
+/// How many levels catch the expected error; `None` when nothing is predicted.
+fn level_count(finest: &Level, intrinsics: &Intrinsics, noise: PoseNoise) -> Option<usize> {
+    let mut depths: Vec<f32> = finest
+        .depth_m
+        .iter()
+        .copied()
+        .filter(|z| *z > 0.0)
+        .collect();
+    if depths.len() < PIXELS_MIN {
+        return None;
+    }
+    let middle = depths.len() / 2;
+    let (_, &mut median_m, _) = depths.select_nth_unstable_by(middle, f32::total_cmp);
+    let from_position = intrinsics.fx * noise.position_m / f64::from(median_m);
+    let from_rotation = intrinsics.fx * noise.rotation_rad;
+    let error_px = from_position.hypot(from_rotation);
+    Some(2 + usize::from(error_px > THIRD_LEVEL_PX) + usize::from(error_px > FOURTH_LEVEL_PX))
+}
+
+/// Luminance and variance inside the triangle around a sample.
+#[inline(always)]
+fn interpolate(coarse: &Coarse, sample: Sample) -> (f32, f32) {
+    let Intrinsics { width, height, .. } = coarse.mesh.intrinsics;
+    let (column, row, mut right, mut down) = sample_position(sample);
+    right += if column > width - 2 { 1.0 } else { 0.0 };
+    down += if row > height - 2 { 1.0 } else { 0.0 };
+    let upper_left = row.min(height - 2) * width + column.min(width - 2);
+    let (upper_right, lower_left) = (upper_left + 1, upper_left + width);
+    let (corner, weights) = if right + down <= 1.0 {
+        (upper_left, [1.0 - right - down, right, down])
+    } else {
+        (
+            lower_left + 1,
+            [right + down - 1.0, 1.0 - down, 1.0 - right],
+        )
+    };
+    let corners = [corner, upper_right, lower_left];
+    corners
+        .into_iter()
+        .zip(weights)
+        .fold((0.0, 0.0), |(luminance, variance), (pixel, weight)| {
+            (
+                luminance + weight * coarse.luminance[pixel],
+                variance + weight * coarse.variance[pixel],
+            )
+        })
+}
+
+/// `(depth, luminance, variance, weight)` of the views that see a pixel -> luminance, variance with their disagreement,
+/// and depth of those near the middle depth.
+fn merge(seen: &mut [(f32, f32, f32, f32)]) -> (f32, f32, f32) {
+    seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let middle = seen[(seen.len() - 1) / 2].0;
+    let kept = seen
+        .iter()
+        .filter(|view| (view.0 - middle).abs() <= DEPTH_TOLERANCE * middle);
+    let (mut total, mut depth_m, mut luminance, mut square, mut variance) =
+        (0.0, 0.0, 0.0, 0.0, 0.0);
+    for &(z, y, v, weight) in kept {
+        total += weight;
+        depth_m += weight * z;
+        luminance += weight * y;
+        square += weight * y * y;
+        variance += weight * v;
+    }
+    let luminance = luminance / total;
+    let disagreement = (square / total - luminance * luminance).max(0.0);
+    (luminance, variance / total + disagreement, depth_m / total)
+}
+
+/// The comparable pixels of a level: predicted together with their four neighbours.
+fn collect_points(level: &Level, camera: &Intrinsics, points: &mut Vec<Point>) {
+    points.clear();
+    let width = level.width;
+    let (fx, fy) = (camera.fx as f32, camera.fy as f32);
+    let (cx, cy) = (camera.cx as f32, camera.cy as f32);
+    for y in 1..level.height.saturating_sub(1) {
+        for x in 1..width.saturating_sub(1) {
+            let pixel = y * width + x;
+            let around = [pixel, pixel - 1, pixel + 1, pixel - width, pixel + width];
+            if around.iter().any(|&pixel| level.depth_m[pixel] <= 0.0) {
+                continue;
+            }
+            let tau = |pixel: usize| level.luminance[pixel];
+            let slope_x = (tau(pixel + 1) - tau(pixel - 1)) / 2.0 * fx;
+            let slope_y = (tau(pixel + width) - tau(pixel - width)) / 2.0 * fy;
+            let z = level.depth_m[pixel];
+            let (a, b) = ((x as f32 - cx) / fx, (y as f32 - cy) / fy);
+            // grad tau * d pi / d X, X = z (a, b, 1), then [I | -[X]x].
+            let g = [slope_x / z, slope_y / z, -(slope_x * a + slope_y * b) / z];
+            let in_camera = [a * z, b * z, z];
+            let [px, py, pz] = in_camera;
+            let jacobian = [
+                g[0],
+                g[1],
+                g[2],
+                py * g[2] - pz * g[1],
+                pz * g[0] - px * g[2],
+                px * g[1] - py * g[0],
+            ];
+            points.push(Point {
+                in_camera,
+                jacobian,
+                luminance: tau(pixel),
+                inverse_sd: 1.0 / (level.variance[pixel] + SENSOR_VARIANCE).sqrt(),
+            });
+        }
+    }
+}
+
+/// (translation, rotation vector) of a small motion.
+fn logarithm(motion: &Isometry3<f64>) -> SVector<f64, 6> {
+    let (t, r) = (motion.translation.vector, motion.rotation.scaled_axis());
+    SVector::from([t.x, t.y, t.z, r.x, r.y, r.z])
+}
+
+fn exponential(d: &Vector8) -> Isometry3<f64> {
+    Isometry3::from_parts(
+        Translation3::new(d[0], d[1], d[2]),
+        UnitQuaternion::from_scaled_axis(Vector3::new(d[3], d[4], d[5])),
+    )
+}

@@ -1,0 +1,258 @@
+//! How much an observation changes a belief (section IV): the Kullback-Leibler divergence of posterior and prior.
+//!
+//! Prior (as stored: before forgetting, before (10)) and posterior -> nats, summed over Y, Cb, Cr (16) to (23), in the
+//! log domain: T1 + T3 simplify to `alpha0 ln(beta/beta0) + (alpha - alpha0) psi(alpha) + lnG(alpha0) - lnG(alpha)`.
+//! With an earlier appearance the belief is a mixture of two; its surprise is exact by the chain rule (steps 5 and 6 of
+//! the robust preset). Edges may widen the prior for the score (step 4).
+
+use crate::{
+    model::belief::{Belief, CHANNELS},
+    stages::{lanes::ln, update::UpdateRules},
+};
+
+const DEGREE: usize = 12;
+
+/// The gamma terms `lnG(alpha0) - lnG(alpha) + (alpha - alpha0) psi(alpha)` with `alpha = f alpha0 + 1/2`: they depend on
+/// alpha0 alone, which stays in a short range, so one polynomial serves the three channels.
+#[derive(Debug, Clone)]
+pub struct GammaTerm {
+    center: f32,
+    scale: f32,
+    /// In `(alpha0 - center) * scale`, lowest power first.
+    coefficients: [f32; DEGREE + 1],
+}
+
+impl GammaTerm {
+    /// Interpolates at the Chebyshev nodes of the range that alpha can take; exact to 2e-8 for f = 0.8.
+    pub fn new(rules: &UpdateRules) -> Self {
+        let (low, high) = rules.alpha_range();
+        // Stored values are rounded to 11 bits.
+        let (low, high) = (f64::from(low) * 0.999, f64::from(high) * 1.001);
+        let center = (low + high) / 2.0;
+        let half = (high - low) / 2.0;
+        let n = DEGREE + 1;
+        let value = |alpha0: f64| {
+            let alpha = f64::from(rules.forgetting) * alpha0 + 0.5;
+            libm::lgamma(alpha0) - libm::lgamma(alpha) + (alpha - alpha0) * digamma(alpha)
+        };
+        let angle = |k: usize| std::f64::consts::PI * (k as f64 + 0.5) / n as f64;
+        // Chebyshev coefficients, then their sum as powers.
+        let mut powers = [0.0f64; DEGREE + 1];
+        let mut previous = [0.0f64; DEGREE + 1];
+        let mut current = [0.0f64; DEGREE + 1];
+        current[0] = 1.0;
+        for order in 0..n {
+            let weight = if order == 0 { 1.0 } else { 2.0 } / n as f64;
+            let coefficient: f64 = weight
+                * (0..n)
+                    .map(|k| {
+                        value(center + half * angle(k).cos()) * (order as f64 * angle(k)).cos()
+                    })
+                    .sum::<f64>();
+            for (power, current) in powers.iter_mut().zip(current) {
+                *power += coefficient * current;
+            }
+            // T(n+1) = 2 t T(n) - T(n-1), and T(1) = t.
+            let factor = if order == 0 { 1.0 } else { 2.0 };
+            let mut next = [0.0; DEGREE + 1];
+            for power in 0..DEGREE {
+                next[power + 1] = factor * current[power];
+            }
+            for (next, previous) in next.iter_mut().zip(previous) {
+                *next -= previous;
+            }
+            previous = current;
+            current = next;
+        }
+        Self {
+            center: center as f32,
+            scale: (1.0 / half) as f32,
+            coefficients: powers.map(|power| power as f32),
+        }
+    }
+
+    #[inline(always)]
+    pub fn at(&self, alpha0: f32) -> f32 {
+        let t = (alpha0 - self.center) * self.scale;
+        let mut sum = self.coefficients[DEGREE];
+        for power in (0..DEGREE).rev() {
+            sum = sum * t + self.coefficients[power];
+        }
+        sum
+    }
+}
+
+/// psi(x) for x > 0: recurrence to where the asymptotic series holds to double precision.
+fn digamma(x: f64) -> f64 {
+    let mut x = x;
+    let mut sum = 0.0;
+    while x < 12.0 {
+        sum -= 1.0 / x;
+        x += 1.0;
+    }
+    let r = 1.0 / (x * x);
+    sum + x.ln()
+        - 0.5 / x
+        - r * (1.0 / 12.0 - r * (1.0 / 120.0 - r * (1.0 / 252.0 - r * (1.0 / 240.0 - r / 132.0))))
+}
+
+/// Per channel the parts of the surprise that need no logarithm, and what goes under the shared ones:
+/// `(plain, beta ratio, sigma ratio)`.
+#[inline(always)]
+pub fn channel_terms(
+    alpha: f32,
+    prior: (f32, f32, f32),
+    posterior: (f32, f32, f32),
+) -> (f32, f32, f32) {
+    let (beta0, tau0, sigma0) = prior;
+    let (beta, tau, sigma) = posterior;
+    let precision = alpha / beta;
+    let moved = tau - tau0;
+    let plain =
+        (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5;
+    (plain, beta / beta0, sigma0 / sigma)
+}
+
+/// (16) to (23), nats. `ratios` are the products of the channels' ratios.
+#[inline(always)]
+pub fn total(
+    alpha0: f32,
+    plain: f32,
+    beta_ratios: f32,
+    sigma_ratios: f32,
+    gamma: &GammaTerm,
+) -> f32 {
+    let sum = plain
+        + alpha0 * ln(beta_ratios)
+        + 0.5 * ln(sigma_ratios)
+        + CHANNELS as f32 * gamma.at(alpha0);
+    // A divergence is never negative; rounding may be.
+    sum.max(0.0)
+}
+
+/// The surprise of one pixel whose belief has one appearance.
+#[inline(always)]
+pub fn surprise(prior: &Belief, posterior: &Belief, gamma: &GammaTerm) -> f32 {
+    let mut plain = 0.0;
+    let (mut beta_ratios, mut sigma_ratios) = (1.0, 1.0);
+    for c in 0..CHANNELS {
+        let (p, b, s) = channel_terms(
+            posterior.alpha,
+            (prior.beta[c], prior.tau[c], prior.sigma[c]),
+            (posterior.beta[c], posterior.tau[c], posterior.sigma[c]),
+        );
+        plain += p;
+        beta_ratios *= b;
+        sigma_ratios *= s;
+    }
+    total(prior.alpha, plain, beta_ratios, sigma_ratios, gamma)
+}
+
+/// From this weight on an earlier appearance takes part.
+pub const P2_MIN: f32 = 0.05;
+/// The variance and mean's scale that an earlier appearance is given, grey levels squared.
+const EARLIER_VARIANCE: f32 = 100.0;
+const EARLIER_SIGMA: f32 = 0.3;
+/// However much speaks for one appearance, the other stays thinkable: coming back costs at most ln(1/0.45) nats.
+const EARLIER_SHARE: (f32, f32) = (0.45, 0.55);
+
+/// The belief that the earlier appearance stands for.
+pub fn earlier_belief(prior: &Belief) -> Belief {
+    Belief {
+        beta: [prior.alpha * EARLIER_VARIANCE; CHANNELS],
+        tau: prior.tau2,
+        sigma: [EARLIER_SIGMA; CHANNELS],
+        ..*prior
+    }
+}
+
+/// Surprise of the joint belief (which appearance, its parameters), and how much the observation speaks for the earlier
+/// one: `(nats, rho2)`. `surprise1` is that of the main appearance alone.
+pub fn joint_surprise(
+    prior: &Belief,
+    observed: [f32; CHANNELS],
+    surprise1: f32,
+    rules: &UpdateRules,
+    gamma: &GammaTerm,
+) -> (f32, f32) {
+    let earlier = earlier_belief(prior);
+    let surprise2 = surprise(&earlier, &rules.belief(&earlier, observed), gamma);
+    let (low, high) = EARLIER_SHARE;
+    let p2 = prior.p2.clamp(low, high);
+    let p1 = 1.0 - p2;
+    let log_odds =
+        log_predictive(&earlier, observed) - log_predictive(prior, observed) + (p2 / p1).ln();
+    let rho2 = 1.0 / (1.0 + (-log_odds).exp());
+    let rho1 = 1.0 - rho2;
+    let term = |rho: f32, p: f32, surprise: f32| {
+        if rho > 0.0 {
+            rho * ((rho / p).ln() + surprise)
+        } else {
+            0.0
+        }
+    };
+    let sum = term(rho1, p1, surprise1) + term(rho2, p2, surprise2);
+    (sum.max(0.0), rho2)
+}
+
+/// Logarithm of the predictive density (Student's t with 2 alpha degrees of freedom), up to what depends on alpha alone.
+fn log_predictive(belief: &Belief, observed: [f32; CHANNELS]) -> f32 {
+    let mut sum = 0.0;
+    for ((&beta, &sigma), (&tau, x)) in belief
+        .beta
+        .iter()
+        .zip(&belief.sigma)
+        .zip(belief.tau.iter().zip(observed))
+    {
+        // 2 alpha times the squared scale.
+        let spread = 2.0 * beta * (1.0 + sigma);
+        let difference = x - tau;
+        sum -=
+            0.5 * spread.ln() + (belief.alpha + 0.5) * (difference * difference / spread).ln_1p();
+    }
+    sum
+}
+
+/// Mean squared one-sided difference of one plane in x plus that in y: G of step 4, squared grey levels a pixel.
+/// Differences to pixels that nobody saw do not count. `None` = beyond the image.
+#[inline(always)]
+pub fn edge_gradient_row(
+    plane: (Option<&[f32]>, &[f32], Option<&[f32]>),
+    coverage: (Option<&[f32]>, &[f32], Option<&[f32]>),
+    gradient: &mut [f32],
+) {
+    let width = gradient.len();
+    gradient.fill(0.0);
+    let (above, here, below) = plane;
+    let (seen_above, seen, seen_below) = coverage;
+    let squared = |a: f32, seen_a: f32, b: f32, seen_b: f32| {
+        let both = if seen_a > 0.0 && seen_b > 0.0 {
+            1.0
+        } else {
+            0.0
+        };
+        ((a - b) * (a - b) * both, both)
+    };
+    for x in 0..width {
+        let (left, has_left) = if x > 0 {
+            squared(here[x], seen[x], here[x - 1], seen[x - 1])
+        } else {
+            (0.0, 0.0)
+        };
+        let (right, has_right) = if x + 1 < width {
+            squared(here[x], seen[x], here[x + 1], seen[x + 1])
+        } else {
+            (0.0, 0.0)
+        };
+        gradient[x] = (left + right) / (has_left + has_right).max(1.0);
+    }
+    let row = |row: Option<&[f32]>, seen_row: Option<&[f32]>, x: usize| match (row, seen_row) {
+        (Some(row), Some(seen_row)) => squared(here[x], seen[x], row[x], seen_row[x]),
+        _ => (0.0, 0.0),
+    };
+    for (x, gradient) in gradient.iter_mut().enumerate() {
+        let (up, has_up) = row(above, seen_above, x);
+        let (down, has_down) = row(below, seen_below, x);
+        *gradient += (up + down) / (has_up + has_down).max(1.0);
+    }
+}
