@@ -26,10 +26,11 @@ pub struct Belief {
 ///
 /// ```text
 /// spread  f16   alpha  beta_y beta_cb beta_cr  sigma_y sigma_cb sigma_cr  p2
-/// level   i16   tau_y tau_cb tau_cr  tau2_y tau2_cb tau2_cr  -  -          in 1/128
+/// level   i16   tau_y tau_cb tau_cr  tau2_y tau2_cb tau2_cr  -  -          in 1/128, less LEVEL_OFFSET
 /// ```
 ///
-/// Fixed point for tau, because f16 at grey level 200 would change the surprise by 11 %.
+/// Fixed point for tau, because f16 at grey level 200 would change the surprise by 11 %. Luminance is stored around 128,
+/// because an observation divided by the exposure gain reaches 255 / 0.7.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C, align(32))]
 pub struct Record {
@@ -39,6 +40,8 @@ pub struct Record {
 
 /// Steps of stored tau and tau2 per grey level.
 pub const LEVEL_SCALE: f32 = 128.0;
+/// Grey level that is stored as 0, by lane.
+pub const LEVEL_OFFSET: [f32; 8] = [128.0, 0.0, 0.0, 128.0, 0.0, 0.0, 0.0, 0.0];
 
 /// Bounds of what f16 holds with full precision; beta leaves them on a perfectly still picture and after a change.
 pub const SPREAD_MIN: f32 = 6.103_515_6e-5;
@@ -53,6 +56,11 @@ impl Record {
         let [e0, e1, e2] = belief.tau2;
         let spread = [belief.alpha, b0, b1, b2, s0, s1, s2]
             .map(|value| f16_from_f32(value.clamp(SPREAD_MIN, SPREAD_MAX)));
+        let mut level = [0; 8];
+        for (lane, value) in [t0, t1, t2, e0, e1, e2].into_iter().enumerate() {
+            // The cast saturates.
+            level[lane] = ((value - LEVEL_OFFSET[lane]) * LEVEL_SCALE).round_ties_even() as i16;
+        }
         Self {
             spread: [
                 spread[0],
@@ -64,17 +72,17 @@ impl Record {
                 spread[6],
                 f16_from_f32(belief.p2.clamp(0.0, 1.0)),
             ],
-            level: [t0, t1, t2, e0, e1, e2, 0.0, 0.0].map(|value: f32| {
-                // The cast saturates: a gain-corrected highlight may exceed the range.
-                (value * LEVEL_SCALE).round_ties_even() as i16
-            }),
+            level,
         }
     }
 
     #[inline(always)]
     pub fn unpack(&self) -> Belief {
         let spread = self.spread.map(f32_from_f16);
-        let level = self.level.map(|value| f32::from(value) / LEVEL_SCALE);
+        let mut level = self.level.map(|value| f32::from(value) / LEVEL_SCALE);
+        for (level, offset) in level.iter_mut().zip(LEVEL_OFFSET) {
+            *level += offset;
+        }
         Belief {
             alpha: spread[0],
             beta: [spread[1], spread[2], spread[3]],

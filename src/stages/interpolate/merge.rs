@@ -5,7 +5,7 @@
 //! this visit count little, disagreement adds to the variance, and what the outvoted remember becomes the earlier
 //! appearance. Each of these is a switch.
 
-use crate::model::belief::{Belief, CHANNELS, LEVEL_SCALE, Record, f32_from_f16};
+use crate::model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16};
 
 use super::{
     prior,
@@ -144,7 +144,10 @@ fn gather(view: &MergeView, sample: Sample) -> Gathered {
         &view.records[upper_right],
         &view.records[lower_left],
     ];
-    let mut gathered = Gathered::default();
+    let mut gathered = Gathered {
+        spread: [0.0; 8],
+        level: LEVEL_OFFSET,
+    };
     for (record, w) in records.into_iter().zip(w) {
         for lane in 0..8 {
             gathered.spread[lane] += w * f32_from_f16(record.spread[lane]);
@@ -153,7 +156,7 @@ fn gather(view: &MergeView, sample: Sample) -> Gathered {
     }
     if gathered.spread[7] > 0.0 {
         // tau2 means nothing where p2 is 0, so p2 weighs it.
-        let mut level = [0.0; CHANNELS];
+        let mut level: [f32; CHANNELS] = std::array::from_fn(|c| LEVEL_OFFSET[3 + c]);
         for (record, w) in records.into_iter().zip(w) {
             let w = w * f32_from_f16(record.spread[7]) / gathered.spread[7];
             for (channel, level) in level.iter_mut().enumerate() {
