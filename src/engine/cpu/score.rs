@@ -7,14 +7,11 @@ use crate::{
     model::belief::{Belief, CHANNELS, Record},
     stages::{
         interpolate::prior::{self, Prior, PriorRow},
+        lanes::{LANES, Lanes},
         surprise::{GammaTerm, P2_MIN, channel_terms, edge_gradient_row, joint_surprise, total},
         update::UpdateRules,
     },
 };
-
-/// Values a step: one AVX-512 register of f32.
-const LANES: usize = 16;
-type Lanes = [f32; LANES];
 
 /// Variance that a new or exchanged appearance keeps, grey levels squared.
 const CHANGED_VARIANCE: (f32, f32) = (60.0, 400.0);
