@@ -286,6 +286,7 @@ impl Pipeline {
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
+            self.settings.view_distance_max_m,
         )
     }
 
