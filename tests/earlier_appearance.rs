@@ -50,7 +50,7 @@ fn the_engines_joint_surprise_is_exact() {
         let prior = belief(&mut random, p2);
         let blend = random.uniform(0.0, 1.0) as f32;
         let x = std::array::from_fn(|c| prior.tau[c] + blend * (prior.tau2[c] - prior.tau[c]));
-        let surprise1 = surprise(&prior, &rules.belief(&prior, x), &gamma);
+        let surprise1 = surprise(&prior, &rules.belief(&prior, x), x, &gamma);
         let (got, rho2) = joint_surprise(&prior, x, surprise1, &rules, &gamma);
 
         let main = channels(&prior);
@@ -85,10 +85,10 @@ fn coming_back_costs_at_most_the_odds_and_its_own_change() {
         prior.beta = [prior.alpha * 25.0; CHANNELS];
         prior.sigma = [0.1; CHANNELS];
         let x = prior.tau2;
-        let alone = surprise(&prior, &rules.belief(&prior, x), &gamma);
+        let alone = surprise(&prior, &rules.belief(&prior, x), x, &gamma);
         let (joint, rho2) = joint_surprise(&prior, x, alone, &rules, &gamma);
         let earlier = surprised::stages::surprise::earlier_belief(&prior);
-        let own = surprise(&earlier, &rules.belief(&earlier, x), &gamma);
+        let own = surprise(&earlier, &rules.belief(&earlier, x), x, &gamma);
         assert!(alone > 6.0, "{alone}");
         assert!(joint <= own + (1.0f32 / 0.45).ln() + 1e-3, "{joint} {own}");
         assert!(rho2 > 0.99);
