@@ -299,6 +299,8 @@ fn a_view_from_its_own_pose_returns_itself_bit_for_bit() {
                             expected.p2 = 0.0;
                             expected.tau2 = got.tau2;
                         }
+                        // What was there before is never certain.
+                        expected.p2 = expected.p2.min(0.95);
                         // tau2 is divided by the weight that it was multiplied with.
                         for c in 0..3 {
                             assert!((got.tau2[c] - expected.tau2[c]).abs() < 1e-3, "{place}");

@@ -258,10 +258,12 @@ fn draw_triangle(vertices: [Vertex; 3], width: usize, strip: &Range<usize>, map:
     if area <= 0.0 {
         return;
     }
-    let x_min = a.x.min(b.x).min(c.x).ceil().max(0.0);
-    let x_max = a.x.max(b.x).max(c.x).floor().min(width as f32 - 1.0);
-    let y_min = a.y.min(b.y).min(c.y).ceil().max(strip.start as f32);
-    let y_max = a.y.max(b.y).max(c.y).floor().min(strip.end as f32 - 1.0);
+    let first = |low: f32, start: usize| (low - EDGE_SLACK).ceil().max(start as f32);
+    let last = |high: f32, end: usize| (high + EDGE_SLACK).floor().min(end as f32 - 1.0);
+    let x_min = first(a.x.min(b.x).min(c.x), 0);
+    let x_max = last(a.x.max(b.x).max(c.x), width);
+    let y_min = first(a.y.min(b.y).min(c.y), strip.start);
+    let y_max = last(a.y.max(b.y).max(c.y), strip.end);
     if x_min > x_max || y_min > y_max {
         return;
     }
@@ -295,6 +297,6 @@ fn draw_triangle(vertices: [Vertex; 3], width: usize, strip: &Range<usize>, map:
     }
 }
 
-/// Of a triangle's weights: rounding in single precision must not open a crack between neighbours. A view drawn from
-/// its own pose has every pixel exactly on a vertex.
+/// Of a triangle's weights and, in pixels, of its bounds: rounding in single precision must not open a crack between
+/// neighbours. A view drawn from its own pose has every pixel exactly on a vertex, those of the border too.
 const EDGE_SLACK: f32 = 1e-3;
