@@ -241,6 +241,7 @@ impl Differencing {
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
+            self.settings.view_distance_max_m,
         )
     }
 }
