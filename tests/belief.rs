@@ -50,7 +50,9 @@ fn any_observation(random: &mut Random, prior: &Belief) -> [f32; CHANNELS] {
         2 => 5.0,
         _ => return any_colour(random),
     };
-    prior.tau.map(|tau| tau + random.uniform(-reach, reach) as f32)
+    prior
+        .tau
+        .map(|tau| tau + random.uniform(-reach, reach) as f32)
 }
 
 fn assert_posterior(got: &Belief, expected: &joint::Scored, size: [f32; 3], context: &str) {
@@ -179,12 +181,18 @@ fn assert_stored(got: &Belief, expected: &joint::Scored, context: &str) {
         let expected = expected.clamp(SPREAD_MIN.into(), SPREAD_MAX.into());
         let error = (f64::from(got) - expected).abs();
         let step = 1.0 / 2048.0 + 1e-5;
-        assert!(error <= step * expected, "{got} is not {expected}: {context}");
+        assert!(
+            error <= step * expected,
+            "{got} is not {expected}: {context}"
+        );
     };
     let level = |got: f32, expected: f64| {
         let expected = expected.min(f64::from(i16::MAX) / 128.0);
         let error = (f64::from(got) - expected).abs();
-        assert!(error <= 0.5 / 128.0 + 1e-3, "{got} is not {expected}: {context}");
+        assert!(
+            error <= 0.5 / 128.0 + 1e-3,
+            "{got} is not {expected}: {context}"
+        );
     };
     spread(got.alpha, expected.alpha);
     for c in 0..CHANNELS {
@@ -196,7 +204,12 @@ fn assert_stored(got: &Belief, expected: &joint::Scored, context: &str) {
         }
     }
     let error = (f64::from(got.p2) - expected.p2).abs();
-    assert!(error < 1e-3, "p2 {} is not {}: {context}", got.p2, expected.p2);
+    assert!(
+        error < 1e-3,
+        "p2 {} is not {}: {context}",
+        got.p2,
+        expected.p2
+    );
 }
 
 #[test]
@@ -218,8 +231,7 @@ fn the_engine_scores_an_image_as_the_paper_and_the_robust_steps_say() {
                 for x in 0..SIZE.0 {
                     let pixel = y * SIZE.0 + x;
                     let belief = prior.belief(x, y);
-                    let observed: [f32; 3] =
-                        std::array::from_fn(|c| observation.planes[c][pixel]);
+                    let observed: [f32; 3] = std::array::from_fn(|c| observation.planes[c][pixel]);
                     let coverage = f64::from(prior.row(y).plane(prior::COVERAGE)[x]);
                     let expected = joint::score(
                         &belief,
@@ -263,7 +275,10 @@ fn every_instruction_set_and_number_of_threads_gives_the_same_bits() {
                 scores.push((bits, score.posterior, score.gain.to_bits()));
             }
         }
-        assert!(scores.windows(2).all(|pair| pair[0] == pair[1]), "{preset:?}");
+        assert!(
+            scores.windows(2).all(|pair| pair[0] == pair[1]),
+            "{preset:?}"
+        );
     }
 }
 

@@ -25,7 +25,12 @@ fn texture(seed: u64) -> reference::scene::Texture {
             let k = std::f64::consts::TAU / random.log_uniform(0.12, 0.8);
             let direction = random.uniform(0.0, std::f64::consts::TAU);
             let phase = random.uniform(0.0, std::f64::consts::TAU);
-            [k * direction.cos(), k * direction.sin(), phase, random.uniform(6.0, 14.0)]
+            [
+                k * direction.cos(),
+                k * direction.sin(),
+                phase,
+                random.uniform(6.0, 14.0),
+            ]
         })
         .collect();
     Box::new(move |a, b| {
@@ -74,7 +79,11 @@ const WAY: std::ops::Range<usize> = 2..STEPS - 2;
 fn arc(step: usize, offset_m: f64) -> Pose {
     let angle = 0.03 * (step as f64 - (STEPS as f64 - 1.0) / 2.0);
     pose(
-        [1.35 * angle.sin() + offset_m, offset_m, 1.35 * (1.0 - angle.cos())],
+        [
+            1.35 * angle.sin() + offset_m,
+            offset_m,
+            1.35 * (1.0 - angle.cos()),
+        ],
         [-0.03, -angle, 0.0],
     )
 }
@@ -114,7 +123,10 @@ fn object_box(world_from_camera: &Pose) -> PixelBox {
 
 fn finds(report: &Report, world_from_camera: &Pose) -> bool {
     let truth = object_box(world_from_camera);
-    report.regions.iter().any(|region| region.pixel_box.iou(&truth) > 0.4)
+    report
+        .regions
+        .iter()
+        .any(|region| region.pixel_box.iou(&truth) > 0.4)
 }
 
 struct Robot {
@@ -142,7 +154,10 @@ impl Robot {
             self.see(scene, &arc(step, 0.0));
         }
         for step in 0..8 {
-            self.see(scene, &pose([3.0 + 0.1 * f64::from(step), 0.0, 0.0], [0.0; 3]));
+            self.see(
+                scene,
+                &pose([3.0 + 0.1 * f64::from(step), 0.0, 0.0], [0.0; 3]),
+            );
         }
     }
 }
@@ -154,8 +169,16 @@ fn a_learnt_place_is_not_surprising() {
         robot.learn(&place(false));
         for step in WAY {
             let report = robot.see(&place(false), &arc(step, 0.006));
-            assert!(report.regions.is_empty(), "{preset:?} {step}: {:?}", report.regions);
-            assert!(report.coverage > 0.9, "{preset:?} {step}: {}", report.coverage);
+            assert!(
+                report.regions.is_empty(),
+                "{preset:?} {step}: {:?}",
+                report.regions
+            );
+            assert!(
+                report.coverage > 0.9,
+                "{preset:?} {step}: {}",
+                report.coverage
+            );
         }
     }
 }
@@ -175,7 +198,10 @@ fn a_passing_robot_reports_a_new_object_on_its_whole_way() {
             object_box(&here)
         );
         let center = report.regions[0].center_in_world.expect("it has depth");
-        assert!((center - Point3::new(0.0, 0.1, 1.35)).norm() < 0.06, "{center}");
+        assert!(
+            (center - Point3::new(0.0, 0.1, 1.35)).norm() < 0.06,
+            "{center}"
+        );
         ids.push(report.regions[0].id);
     }
     assert!(ids.windows(2).all(|pair| pair[0] == pair[1]), "{ids:?}");
@@ -192,7 +218,11 @@ fn a_passing_robot_reports_a_new_object_on_its_whole_way() {
         let here = arc(step, 0.002);
         missed += usize::from(finds(&robot.see(&place(false), &here), &here));
     }
-    assert!(missed <= 2, "its removal surprised in {missed} of {}", WAY.len());
+    assert!(
+        missed <= 2,
+        "its removal surprised in {missed} of {}",
+        WAY.len()
+    );
 }
 
 #[test]
@@ -277,14 +307,26 @@ fn rejected_frames_change_nothing_and_say_why() {
             assert_eq!(refused.code(), code, "{refused}");
             assert_eq!(bothered.pipeline.evaluate(&frame).expect_err(code), refused);
         }
-        assert_eq!(plain.see(&place(false), &here), bothered.see(&place(false), &here));
+        assert_eq!(
+            plain.see(&place(false), &here),
+            bothered.see(&place(false), &here)
+        );
         assert!(same_memory(&plain.pipeline, &bothered.pipeline));
     }
 }
 
 #[test]
 fn frames_of_any_size_are_processed() {
-    for (width, height) in [(1, 1), (1, 40), (40, 1), (2, 2), (3, 5), (4, 400), (17, 19), (61, 7)] {
+    for (width, height) in [
+        (1, 1),
+        (1, 40),
+        (40, 1),
+        (2, 2),
+        (3, 5),
+        (4, 400),
+        (17, 19),
+        (61, 7),
+    ] {
         for preset in [Preset::Paper, Preset::Robust] {
             let mut robot = Robot::new(Settings::preset(preset));
             for sequence in 0..3 {

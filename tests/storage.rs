@@ -55,8 +55,14 @@ fn storing_every_posterior_changes_the_mean_surprise_by_less_than_a_percent() {
             let exact = mean_surprise(&settings, grey, false);
             let stored = mean_surprise(&settings, grey, true);
             let change = (stored / exact - 1.0).abs();
-            println!("{preset:?} at {grey}: {exact:.4} nats, stored {stored:.4}, {:.3} %", 100.0 * change);
-            assert!(change < 0.01, "{preset:?} at {grey}: {exact} became {stored}");
+            println!(
+                "{preset:?} at {grey}: {exact:.4} nats, stored {stored:.4}, {:.3} %",
+                100.0 * change
+            );
+            assert!(
+                change < 0.01,
+                "{preset:?} at {grey}: {exact} became {stored}"
+            );
         }
     }
 }
