@@ -61,11 +61,11 @@ fn assert_posterior(got: &Belief, expected: &joint::Scored, size: [f32; 3], cont
         assert!(error <= 1e-5 * size, "{got} is not {expected}: {context}");
     };
     near(got.alpha, expected.alpha, expected.alpha);
-    for c in 0..CHANNELS {
+    for (c, size) in size.into_iter().enumerate() {
         near(got.beta[c], expected.beta[c], expected.beta[c]);
         near(got.sigma[c], expected.sigma[c], expected.sigma[c]);
         // Of what it is made of: between red and green grey is a small number.
-        near(got.tau[c], expected.tau[c], size[c].into());
+        near(got.tau[c], expected.tau[c], size.into());
     }
 }
 
