@@ -1,5 +1,7 @@
 pub mod config;
 
+pub mod commands;
+
 pub mod pipeline;
 
 pub mod stages;
@@ -7,5 +9,9 @@ pub mod stages;
 pub mod engine;
 
 pub mod memory;
+
+pub mod evaluation;
+
+pub mod dataset;
 
 pub mod model;

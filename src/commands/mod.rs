@@ -1,0 +1,3 @@
+//! How it is started: a file a verb.
+
+pub mod evaluate;
