@@ -6,18 +6,25 @@ use std::{
     time::Duration,
 };
 
-use anyhow::{Context, anyhow, bail};
-use tokio::time::{Instant, sleep_until};
+use anyhow::{Context, ensure};
+use tokio::time::Instant;
 
 use crate::{
     dataset::Recording,
-    model::frame::Source,
-    service::robot::{Answer, PictureFile, Robot},
-    wire::{keys::CameraPath, proto},
+    service::{
+        robot::{Answer, PictureFile, Robot},
+        session::{self, ZenohOptions},
+    },
+    wire::{
+        keys::{self, CameraPath, is_id},
+        proto,
+    },
 };
 
 /// To find a service, and to hear about a frame. Far longer than any frame takes.
 const PATIENCE: Duration = Duration::from_secs(10);
+const RATE_MIN_HZ: f64 = 0.01;
+const RATE_MAX_HZ: f64 = 1000.0;
 
 #[derive(Debug, clap::Args)]
 pub struct Arguments {
@@ -38,6 +45,33 @@ pub struct Arguments {
     lockstep: bool,
 }
 
+/// A name that can be a chunk of a key.
+fn id(text: &str) -> Result<String, String> {
+    if is_id(text) {
+        Ok(text.to_owned())
+    } else {
+        Err("names are made of a-z, 0-9, _ and -".to_owned())
+    }
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    text.parse()
+        .ok()
+        .filter(|rate| (RATE_MIN_HZ..=RATE_MAX_HZ).contains(rate))
+        .ok_or_else(|| format!("a rate lies between {RATE_MIN_HZ} and {RATE_MAX_HZ} frames per second"))
+}
+
+/// The image's file as it is, if the wire has its format.
+fn picture_file(path: &Path) -> anyhow::Result<Option<PictureFile>> {
+    let encoding = match path.extension().and_then(OsStr::to_str) {
+        Some("jpg" | "jpeg") => "jpeg",
+        Some("png") => "png",
+        _ => return Ok(None),
+    };
+    let bytes = std::fs::read(path).with_context(|| format!("reading {}", path.display()))?;
+    Ok(Some(PictureFile { encoding, bytes }))
+}
+
 /// What came of the frames.
 #[derive(Debug, Default)]
 struct Tally {
@@ -50,13 +84,15 @@ struct Tally {
 }
 
 impl Tally {
-    fn take(&mut self, answer: Answer) {
+    fn take(&mut self, answer: &Answer) {
         match answer {
             Answer::Report(report) => {
                 self.reports += 1;
                 self.regions += report.regions.len();
                 self.surprising += usize::from(!report.regions.is_empty());
-                report.regions.iter().for_each(|region| print(&report, region));
+                for region in &report.regions {
+                    println!("{}", region_line(report.sequence, region));
+                }
             }
             Answer::Rejected(rejection) => {
                 self.refused += 1;
@@ -67,67 +103,81 @@ impl Tally {
             }
         }
     }
+
+    /// Waits for what the service says about a frame, and says so where it says nothing.
+    async fn hear_about(&mut self, robot: &mut Robot, sequence: u64) {
+        let end = Instant::now() + PATIENCE;
+        while let Some(answer) = robot.answer(end - Instant::now()).await {
+            self.take(&answer);
+            if answer.sequence() == sequence {
+                return;
+            }
+        }
+        self.unanswered += 1;
+        eprintln!("frame {sequence}: neither a report nor a rejection within {PATIENCE:?}");
+    }
 }
 
-fn print(report: &proto::SurpriseReport, region: &proto::Region) {
-    let Some(pixels) = region.r#box else { return };
-    let place = region
-        .center_in_world
-        .as_ref()
-        .map_or_else(String::new, |p| format!(", at {:.2} {:.2} {:.2} m", p.x, p.y, p.z));
-    println!(
-        "frame {} surprised: x {}..{}, y {}..{}, {:.1} nats{place}",
-        report.sequence,
-        pixels.x_min,
-        pixels.x_max,
-        pixels.y_min,
-        pixels.y_max,
-        region.peak_surprise
-    );
+impl std::fmt::Display for Tally {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "{} frames, {} reports, {} refused; {} regions in {} frames",
+            self.frames, self.reports, self.refused, self.regions, self.surprising
+        )
+    }
+}
+
+fn region_line(sequence: u64, region: &proto::Region) -> String {
+    let pixels = region.r#box.unwrap_or_default();
+    let center = region.center_in_world.map_or_else(String::new, |p| {
+        format!(", at {:.2} {:.2} {:.2} m", p.x, p.y, p.z)
+    });
+    format!(
+        "frame {sequence} surprised at x {}..{}, y {}..{}: {:.1} nats{center}",
+        pixels.x_min, pixels.x_max, pixels.y_min, pixels.y_max, region.peak_surprise
+    )
 }
 
 /// # Errors
-/// A recording that cannot be read, no service, and in lockstep frames that got no answer.
+/// A recording that cannot be read, no service, and frames that got no answer.
 pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
     let recording = Recording::open(&arguments.folder)?;
     let path = CameraPath::new(&arguments.place, &arguments.robot, &arguments.camera)
-        .expect("clap checked the names");
+        .context("a name is no id")?;
     let session = session::open(&arguments.zenoh).await?;
-    let mut robot = Robot::join(&session, &arguments.root, &path)
-        .await
-        .map_err(|error| anyhow!(error))?;
-    if !robot.wait_for_service(PATIENCE).await.map_err(|error| anyhow!(error))? {
-        bail!(
-            "nobody takes frames at {}: is `surprised serve` running, and reached by -e?",
-            path.key(&arguments.root, keys::FRAME)
-        );
-    }
+    let mut robot = Robot::join(&session, &arguments.root, &path).await?;
+    ensure!(
+        robot.wait_for_service(PATIENCE).await?,
+        "nobody takes frames at {}: is `surprised serve` running, with this --root, and does -e lead to it?",
+        path.key(&arguments.root, keys::FRAME)
+    );
     let mut tally = Tally::default();
     let started = Instant::now();
     for (index, entry) in recording.entries.iter().enumerate() {
+        let frame = recording.frame(index, &path.source)?;
+        let file = picture_file(&entry.image)?;
         if !arguments.lockstep {
             let due_s = match arguments.rate {
                 Some(rate) => index as f64 / rate,
                 None => entry.stamp_s - recording.entries[0].stamp_s,
             };
             let due = started + Duration::from_secs_f64(due_s);
-            while let Some(left) = due.checked_duration_since(Instant::now()) {
-                if let Some(answer) = robot.answer(left).await {
-                    tally.take(answer);
-                }
+            while let Some(answer) = robot.answer(due - Instant::now()).await {
+                tally.take(&answer);
             }
         }
-        let frame = recording.frame(index, &path.source)?;
-        robot.publish(&frame, picture_file(&entry.image)?).await.map_err(|error| anyhow!(error))?;
+        robot.publish(&frame, file).await?;
         tally.frames += 1;
-        if arguments.lockstep {
+        // The newest frame always gets its turn: when the last is answered, no more answers come.
+        if arguments.lockstep || tally.frames == recording.entries.len() {
             tally.hear_about(&mut robot, frame.sequence).await;
         }
     }
-    if !arguments.lockstep && let Some(last) = tally.frames.checked_sub(1) {
-        // The newest frame is never left out, so its answer is the last.
-        tally.hear_about(&mut robot, last as u64).await;
-    }
     println!("{tally}");
+    if recording.skipped > 0 {
+        eprintln!("{} images without depth or pose were left out", recording.skipped);
+    }
+    ensure!(tally.unanswered == 0, "{} frames got no answer", tally.unanswered);
     Ok(())
 }

@@ -48,6 +48,11 @@ impl Answer {
     }
 }
 
+/// The session is closed or refused something.
+#[derive(Debug, thiserror::Error)]
+#[error("Zenoh: {0}")]
+pub struct RobotError(#[from] zenoh::Error);
+
 /// One camera of a robot. Gone from the network when dropped.
 pub struct Robot {
     frames: Publisher<'static>,
@@ -59,7 +64,7 @@ pub struct Robot {
 impl Robot {
     /// # Errors
     /// A closed session.
-    pub async fn join(session: &Session, root: &str, path: &CameraPath) -> zenoh::Result<Self> {
+    pub async fn join(session: &Session, root: &str, path: &CameraPath) -> Result<Self, RobotError> {
         let (sender, answers) = mpsc::channel(ANSWERS_MAX);
         let hear = |leaf, unpack: fn(&[u8]) -> Result<Answer, Refusal>| {
             let sender = sender.clone();
@@ -103,7 +108,7 @@ impl Robot {
     ///
     /// # Errors
     /// A closed session.
-    pub async fn wait_for_service(&self, patience: Duration) -> zenoh::Result<bool> {
+    pub async fn wait_for_service(&self, patience: Duration) -> Result<bool, RobotError> {
         let changes = self.frames.matching_listener().await?;
         if self.frames.matching_status().await?.matching() {
             return Ok(true);
@@ -123,7 +128,7 @@ impl Robot {
     ///
     /// # Errors
     /// A closed session.
-    pub async fn publish(&self, frame: &Frame, file: Option<PictureFile>) -> zenoh::Result<()> {
+    pub async fn publish(&self, frame: &Frame, file: Option<PictureFile>) -> Result<(), RobotError> {
         let mut message = encode::frame(frame);
         message.calibration = Some(encode::calibration(&Calibration {
             intrinsics: frame.intrinsics,
@@ -136,7 +141,7 @@ impl Robot {
                 ..proto::Image::default()
             });
         }
-        self.frames.put(encode::bytes(&message)).await
+        Ok(self.frames.put(encode::bytes(&message)).await?)
     }
 
     /// The next answer; `None` if none comes in time.
