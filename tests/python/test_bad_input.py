@@ -1,5 +1,6 @@
 """Every kind of bad frame: refused with a reason, the memory as it was, the service goes on."""
 
+import itertools
 import math
 
 import numpy as np
@@ -55,6 +56,26 @@ def clear(*names):
     return spoil
 
 
+@pytest.fixture
+def place():
+    """One for all tests here: a service has room for sixteen, and nothing that is refused changes it."""
+    return "wall"
+
+
+@pytest.fixture
+def robot(session, place):
+    return Robot(session, place, f"robot{next(NUMBERS)}")
+
+
+@pytest.fixture
+def settled(robot):
+    """A robot at a place that knows the wall."""
+    for _ in range(3):
+        assert not robot.show().regions
+    return robot
+
+
+NUMBERS = itertools.count(1)
 METRES = np.full((scene.HEIGHT, scene.WIDTH), 2.0, np.float32)
 
 # What is done to a good frame; the code and some words of the sentence that come back.
@@ -142,9 +163,9 @@ def test_a_bad_frame_is_refused_with_its_reason_and_changes_nothing(session, pla
     "payload, of, code, words",
     [
         (b"\x0a\xff\xff\xff\xff", encoding(Frame), "undecodable", "surprised.v1.Frame"),
-        (b"{}", "application/json", "encoding", "application/json"),
-        (scene.frame(1, 1).SerializeToString(), "", "encoding", "application/protobuf;surprised.v1.Frame"),
-        (scene.frame(1, 1).image.SerializeToString(), encoding(Image), "encoding", "surprised.v1.Image"),
+        (b"{}", "application/json", "wrong_encoding", "application/json"),
+        (scene.frame(1, 1).SerializeToString(), "", "wrong_encoding", "application/protobuf;surprised.v1.Frame"),
+        (scene.frame(1, 1).image.SerializeToString(), encoding(Image), "wrong_encoding", "surprised.v1.Image"),
     ],
     ids=["bytes that are no message", "json", "no encoding", "another message"],
 )
@@ -177,8 +198,9 @@ def test_a_frame_without_calibration_is_refused_until_one_is_published(session, 
 
 
 def test_one_robots_nonsense_never_touches_anothers_frames(session, place, settled):
-    wild = Robot(session, place, "robot2")
+    wild = Robot(session, place, "wild")
     wild.show()
+    assert settled.show().learned
     before = remembered(session, place)
     for spoil, _, _ in BAD.values():
         message = wild.next_frame()
@@ -228,6 +250,6 @@ def test_what_was_refused_is_counted_by_reason(daemon, settled):
     line = [
         line
         for line in metrics.decode().splitlines()
-        if not line.startswith("#") and "no_depth" in line and settled.place in line
+        if not line.startswith("#") and "no_depth" in line and f'"{settled.robot}"' in line
     ]
     assert len(line) == 1 and float(line[0].split()[-1]) == 3, metrics.decode()

@@ -91,9 +91,9 @@ def test_a_plain_get_can_have_json(session, place, settled):
 def test_a_bad_request_is_refused_with_a_sentence(session, place, settled):
     request = prior_request("expected")
     request.intrinsics.fx = -1
-    assert "fx" in refusal(session, f"surprised/{place}/@memory/prior", request)
+    assert "focal" in refusal(session, f"surprised/{place}/@memory/prior", request)
     request = prior_request("taste")
-    assert "taste" in refusal(session, f"surprised/{place}/@memory/prior", request)
+    assert "plane is unknown" in refusal(session, f"surprised/{place}/@memory/prior", request)
     request = prior_request()
     request.intrinsics.width = request.intrinsics.height = 100_000
     assert "100000" in refusal(session, f"surprised/{place}/@memory/prior", request)
@@ -121,5 +121,9 @@ def test_views_names_every_viewpoint(session, place, settled):
 
 
 def test_status_answers(session, place, settled):
-    status = json.loads(ask(session, f"surprised/{place}/@memory/status?format=json").payload.to_string())
-    assert place in json.dumps(status)
+    status = json.loads(ask(session, f"surprised/{place}/@memory/status").payload.to_string())
+    assert (status["place"], status["frames"], status["refused"]) == (place, 8, 0)
+
+
+def test_a_place_nobody_has_seen_is_unknown(session, daemon):
+    assert "unknown_place" in refusal(session, "surprised/nowhere/@memory/views")
