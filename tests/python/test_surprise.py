@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 import scene
+import zenoh
 from daemon import Robot
-from surprised_proto import Image, StampedImage
+from surprised_proto import Image, PoseSample, StampedImage, encoding
 
 
 def test_a_new_object_gets_a_box_around_it(settled):
@@ -120,3 +121,24 @@ def test_maps_come_while_someone_subscribes(session, settled):
     assert len(received["blocks"].image.data) == 4 * pixels // 16
     assert received["coverage"].image.encoding == "mono8" and len(received["coverage"].image.data) == pixels
     assert received["expected"].image.data.startswith(b"\x89PNG")
+
+
+def test_a_frame_without_a_pose_gets_the_one_between_the_samples_around_it(session, settled):
+    message = settled.next_frame(scene.BOX)
+    message.ClearField("world_from_camera")
+    for offset_ns, x in ((-50_000_000, -0.001), (50_000_000, 0.001)):
+        sample = PoseSample()
+        sample.stamp.FromNanoseconds(settled.stamp_ns + offset_ns)
+        sample.world_from_camera.position.x = x
+        sample.world_from_camera.position.z = 1.0
+        sample.world_from_camera.orientation.w = 1.0
+        session.put(
+            f"{settled.key}/pose",
+            sample.SerializeToString(),
+            encoding=encoding(PoseSample),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
+    settled.put(message)
+    report = settled.expect_report(message)
+    assert abs(report.world_from_camera.position.x) < 5e-4
+    assert any(scene.overlap(scene.corners(region.box), scene.BOX) >= 0.6 for region in report.regions)
