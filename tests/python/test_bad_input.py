@@ -246,10 +246,7 @@ def test_what_was_refused_is_counted_by_reason(daemon, settled):
         message.ClearField("depth")
         settled.put(message)
         settled.expect_rejection()
-    _, _, metrics = daemon.fetch("/metrics")
-    line = [
-        line
-        for line in metrics.decode().splitlines()
-        if not line.startswith("#") and "no_depth" in line and f'"{settled.robot}"' in line
-    ]
-    assert len(line) == 1 and float(line[0].split()[-1]) == 3, metrics.decode()
+    cameras = daemon.fetch_json(f"/api/v1/places/{settled.place}")["cameras"]
+    status = next(camera for camera in cameras if camera["robot"] == settled.robot)
+    assert status["refused"] == {"no_depth": 3}
+    assert "depth" in status["last_refusal"]
