@@ -26,10 +26,11 @@ pub struct Belief {
 ///
 /// ```text
 /// spread  f16   alpha  beta_y beta_cb beta_cr  sigma_y sigma_cb sigma_cr  p2
-/// level   i16   tau_y tau_cb tau_cr  tau2_y tau2_cb tau2_cr  -  -          in 1/128
+/// level   i16   tau_y tau_cb tau_cr  tau2_y tau2_cb tau2_cr  -  -          in 1/64
 /// ```
 ///
-/// Fixed point for tau, because f16 at grey level 200 would change the surprise by 11 %.
+/// Fixed point for tau, because f16 at grey level 200 would change the surprise by 11 %. Up to 512, because a highlight
+/// seen through a gain of 0.7 lies at 364.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[repr(C, align(32))]
 pub struct Record {
@@ -38,7 +39,7 @@ pub struct Record {
 }
 
 /// Steps of stored tau and tau2 per grey level.
-pub const LEVEL_SCALE: f32 = 128.0;
+pub const LEVEL_SCALE: f32 = 64.0;
 
 /// Bounds of what f16 holds with full precision; beta leaves them on a perfectly still picture and after a change.
 pub const SPREAD_MIN: f32 = 6.103_515_6e-5;
@@ -65,7 +66,7 @@ impl Record {
                 f16_from_f32(belief.p2.clamp(0.0, 1.0)),
             ],
             level: [t0, t1, t2, e0, e1, e2, 0.0, 0.0].map(|value: f32| {
-                // The cast saturates: a gain-corrected highlight may exceed the range.
+                // The cast saturates.
                 (value * LEVEL_SCALE).round_ties_even() as i16
             }),
         }
