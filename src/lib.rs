@@ -1,3 +1,9 @@
+pub mod commands;
+
+pub mod service;
+
+pub mod wire;
+
 pub mod config;
 
 pub mod pipeline;
