@@ -13,7 +13,7 @@ use crate::{
     dataset::Recording,
     service::{
         robot::{Answer, PictureFile, Robot},
-        session::{self, ZenohOptions},
+        session::ZenohOptions,
     },
     wire::{
         keys::{self, CameraPath, is_id},
@@ -26,8 +26,9 @@ const PATIENCE: Duration = Duration::from_secs(10);
 const RATE_MIN_HZ: f64 = 0.01;
 const RATE_MAX_HZ: f64 = 1000.0;
 
+/// Publishes a recording as a robot would
 #[derive(Debug, clap::Args)]
-pub struct Arguments {
+pub struct Replay {
     /// The recording: a folder with rgb.txt, depth.txt, groundtruth.txt and calibration.txt.
     folder: PathBuf,
     /// The place it was recorded in.
@@ -43,6 +44,11 @@ pub struct Arguments {
     /// Wait for the report on each frame before the next, so that none is left out.
     #[arg(long)]
     lockstep: bool,
+    /// The Zenoh key below which everything is.
+    #[arg(long, value_name = "KEY", default_value = "surprised")]
+    root: String,
+    #[command(flatten)]
+    zenoh: ZenohOptions,
 }
 
 /// A name that can be a chunk of a key.
@@ -58,7 +64,9 @@ fn rate(text: &str) -> Result<f64, String> {
     text.parse()
         .ok()
         .filter(|rate| (RATE_MIN_HZ..=RATE_MAX_HZ).contains(rate))
-        .ok_or_else(|| format!("a rate lies between {RATE_MIN_HZ} and {RATE_MAX_HZ} frames per second"))
+        .ok_or_else(|| {
+            format!("a rate lies between {RATE_MIN_HZ} and {RATE_MAX_HZ} frames per second")
+        })
 }
 
 /// The image's file as it is, if the wire has its format.
@@ -139,45 +147,53 @@ fn region_line(sequence: u64, region: &proto::Region) -> String {
     )
 }
 
-/// # Errors
-/// A recording that cannot be read, no service, and frames that got no answer.
-pub async fn run(arguments: Arguments) -> anyhow::Result<()> {
-    let recording = Recording::open(&arguments.folder)?;
-    let path = CameraPath::new(&arguments.place, &arguments.robot, &arguments.camera)
-        .context("a name is no id")?;
-    let session = session::open(&arguments.zenoh).await?;
-    let mut robot = Robot::join(&session, &arguments.root, &path).await?;
-    ensure!(
-        robot.wait_for_service(PATIENCE).await?,
-        "nobody takes frames at {}: is `surprised serve` running, with this --root, and does -e lead to it?",
-        path.key(&arguments.root, keys::FRAME)
-    );
-    let mut tally = Tally::default();
-    let started = Instant::now();
-    for (index, entry) in recording.entries.iter().enumerate() {
-        let frame = recording.frame(index, &path.source)?;
-        let file = picture_file(&entry.image)?;
-        if !arguments.lockstep {
-            let due_s = match arguments.rate {
-                Some(rate) => index as f64 / rate,
-                None => entry.stamp_s - recording.entries[0].stamp_s,
-            };
-            let due = started + Duration::from_secs_f64(due_s);
-            while let Some(answer) = robot.answer(due - Instant::now()).await {
-                tally.take(&answer);
+impl Replay {
+    /// # Errors
+    /// A recording that cannot be read, no service, and frames that got no answer.
+    pub async fn run(self) -> anyhow::Result<()> {
+        let recording = Recording::open(&self.folder)?;
+        let path =
+            CameraPath::new(&self.place, &self.robot, &self.camera).context("a name is no id")?;
+        let mut robot = Robot::connect(&self.zenoh, &self.root, &path).await?;
+        ensure!(
+            robot.wait_for_service(PATIENCE).await?,
+            "nobody takes frames at {}: is `surprised serve` running, with this --root, and does -e lead to it?",
+            path.key(&self.root, keys::FRAME)
+        );
+        let mut tally = Tally::default();
+        let started = Instant::now();
+        for (index, entry) in recording.entries.iter().enumerate() {
+            let frame = recording.frame(index, &path.source)?;
+            let file = picture_file(&entry.image)?;
+            if !self.lockstep {
+                let due_s = match self.rate {
+                    Some(rate) => index as f64 / rate,
+                    None => entry.stamp_s - recording.entries[0].stamp_s,
+                };
+                let due = started + Duration::from_secs_f64(due_s);
+                while let Some(answer) = robot.answer(due - Instant::now()).await {
+                    tally.take(&answer);
+                }
+            }
+            robot.publish(&frame, file).await?;
+            tally.frames += 1;
+            // The newest frame always gets its turn: when the last is answered, no more answers come.
+            if self.lockstep || tally.frames == recording.entries.len() {
+                tally.hear_about(&mut robot, frame.sequence).await;
             }
         }
-        robot.publish(&frame, file).await?;
-        tally.frames += 1;
-        // The newest frame always gets its turn: when the last is answered, no more answers come.
-        if arguments.lockstep || tally.frames == recording.entries.len() {
-            tally.hear_about(&mut robot, frame.sequence).await;
+        println!("{tally}");
+        if recording.skipped > 0 {
+            eprintln!(
+                "{} images without depth or pose were left out",
+                recording.skipped
+            );
         }
+        ensure!(
+            tally.unanswered == 0,
+            "{} frames got no answer",
+            tally.unanswered
+        );
+        Ok(())
     }
-    println!("{tally}");
-    if recording.skipped > 0 {
-        eprintln!("{} images without depth or pose were left out", recording.skipped);
-    }
-    ensure!(tally.unanswered == 0, "{} frames got no answer", tally.unanswered);
-    Ok(())
 }

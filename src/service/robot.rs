@@ -11,7 +11,9 @@ use zenoh::{
     qos::CongestionControl,
 };
 
+use super::session::ZenohOptions;
 use crate::{
+    config::ConfigError,
     model::{camera::Calibration, frame::Frame, refusal::Refusal},
     wire::{
         decode, encode,
@@ -22,6 +24,8 @@ use crate::{
 
 /// Answers that nobody took yet; more than a service can owe.
 const ANSWERS_MAX: usize = 1024;
+/// Reports have no pictures in them.
+const ANSWER_BYTES_MAX: usize = 1 << 20;
 
 /// A picture that is a file already and goes as it is.
 #[derive(Debug, Clone)]
@@ -48,23 +52,36 @@ impl Answer {
     }
 }
 
-/// The session is closed or refused something.
 #[derive(Debug, thiserror::Error)]
-#[error("Zenoh: {0}")]
-pub struct RobotError(#[from] zenoh::Error);
+pub enum RobotError {
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The session could not be opened, or is closed.
+    #[error("Zenoh: {0}; see -c, -m, -e and -l")]
+    Zenoh(#[from] zenoh::Error),
+}
 
-/// One camera of a robot. Gone from the network when dropped.
+/// One camera of a robot with a session of its own. Gone from the network when dropped.
 pub struct Robot {
     frames: Publisher<'static>,
     answers: mpsc::Receiver<Answer>,
     _subscribers: [Subscriber<()>; 2],
     _token: LivelinessToken,
+    _session: Session,
 }
 
 impl Robot {
     /// # Errors
-    /// A closed session.
-    pub async fn join(session: &Session, root: &str, path: &CameraPath) -> Result<Self, RobotError> {
+    /// Options that Zenoh refuses, or a session that cannot be opened.
+    pub async fn connect(
+        options: &ZenohOptions,
+        root: &str,
+        path: &CameraPath,
+    ) -> Result<Self, RobotError> {
+        if !keys::is_root(root) {
+            return Err(ConfigError::Root(root.to_owned()).into());
+        }
+        let session = zenoh::open(options.config(ANSWER_BYTES_MAX)?).await?;
         let (sender, answers) = mpsc::channel(ANSWERS_MAX);
         let hear = |leaf, unpack: fn(&[u8]) -> Result<Answer, Refusal>| {
             let sender = sender.clone();
@@ -92,15 +109,13 @@ impl Robot {
             // Raw depth is larger than Zenoh's queue: what may be dropped would be, also on an idle network.
             .congestion_control(CongestionControl::Block)
             .await?;
-        let token = session
-            .liveliness()
-            .declare_token(path.live(root))
-            .await?;
+        let token = session.liveliness().declare_token(path.live(root)).await?;
         Ok(Self {
             frames,
             answers,
             _subscribers: subscribers,
             _token: token,
+            _session: session,
         })
     }
 
@@ -128,7 +143,11 @@ impl Robot {
     ///
     /// # Errors
     /// A closed session.
-    pub async fn publish(&self, frame: &Frame, file: Option<PictureFile>) -> Result<(), RobotError> {
+    pub async fn publish(
+        &self,
+        frame: &Frame,
+        file: Option<PictureFile>,
+    ) -> Result<(), RobotError> {
         let mut message = encode::frame(frame);
         message.calibration = Some(encode::calibration(&Calibration {
             intrinsics: frame.intrinsics,
