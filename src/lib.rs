@@ -1,6 +1,10 @@
-pub mod config;
-
 pub mod commands;
+
+pub mod service;
+
+pub mod wire;
+
+pub mod config;
 
 pub mod pipeline;
 
