@@ -53,9 +53,10 @@ pub fn room() -> Vec<Primitive> {
     room.cuboid(at(-2.39, -0.4, 0.0), [0.03, 5.0, 0.12], 0.0, white.clone());
     room.cuboid(at(2.39, -0.4, 0.0), [0.03, 5.0, 0.12], 0.0, white);
     table(&mut room);
-    sideboard(&mut room);
     chair(&mut room, at(0.28, 0.78, 0.0), 0.15);
     chair(&mut room, at(-0.95, 0.62, 0.0), 0.9);
+    let near = room.primitives.len();
+    sideboard(&mut room);
     for (center, size, yaw, seed) in [
         (at(-0.62, 1.985, 1.05), (0.62, 0.46), 0.0, 3),
         (at(0.42, 1.985, 1.22), (0.42, 0.34), 0.0, 9),
@@ -72,9 +73,11 @@ pub fn room() -> Vec<Primitive> {
         };
         room.cuboid(center, [width, 0.03, height], yaw, matte(picture));
     }
-    // A door and a shelf of books on the left.
     room.cuboid(at(-2.38, 1.45, 0.0), [0.05, 0.85, 2.05], 0.0, planks(11));
     bookshelf(&mut room, at(1.75, 1.86, 0.0));
+    for background in &mut room.primitives[near..] {
+        background.casts_shadow = false;
+    }
     room.primitives
 }
 

@@ -43,6 +43,34 @@ impl Primitive {
     pub fn is_glass(&self) -> bool {
         matches!(self.material.finish, Finish::Glass { .. })
     }
+
+    /// Big enough to keep a noticeable part of the sky from what is beside it; the table itself and the like count as
+    /// ground instead, which is darker anyway.
+    fn dims_sky(&self) -> bool {
+        let mut half: [f64; 3] = self.shape.bounds().half().into();
+        half.sort_by(f64::total_cmp);
+        let [thin, broad, long] = half;
+        self.casts_shadow
+            && !self.hollow
+            && !self.is_glass()
+            && thin > 0.010
+            && broad > 0.028
+            && long < 0.5
+    }
+
+    fn hides(&self, light: Light) -> bool {
+        match light {
+            Light::Lamp => self.casts_shadow,
+            Light::Sky => self.dims_sky(),
+        }
+    }
+}
+
+/// What light a primitive may hide.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Light {
+    Lamp,
+    Sky,
 }
 
 /// The nearest thing on a ray.
@@ -55,6 +83,10 @@ pub struct Hit {
 #[derive(Debug, Clone)]
 pub struct Scene {
     primitives: Vec<Primitive>,
+    /// Of each primitive.
+    bounds: Vec<Bounds>,
+    /// Of each primitive: whether it may hide the lamp, and the sky.
+    hides: Vec<[bool; 2]>,
     nodes: Vec<Node>,
 }
 
@@ -64,7 +96,8 @@ struct Node {
     /// Leaf: its primitives. Branch: `count` is 0, the left child follows, `start` is the right one.
     start: u32,
     count: u32,
-    casts_shadow: bool,
+    hides_lamp: bool,
+    hides_sky: bool,
 }
 
 const LEAF: usize = 2;
@@ -75,11 +108,24 @@ impl Scene {
         if !primitives.is_empty() {
             build(&mut primitives, 0, &mut nodes);
         }
-        Self { primitives, nodes }
+        Self {
+            bounds: primitives.iter().map(|primitive| primitive.shape.bounds()).collect(),
+            hides: primitives
+                .iter()
+                .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
+                .collect(),
+            primitives,
+            nodes,
+        }
     }
 
     pub fn primitives(&self) -> &[Primitive] {
         &self.primitives
+    }
+
+    /// Of each primitive.
+    pub fn bounds(&self) -> &[Bounds] {
+        &self.bounds
     }
 
     /// Of the primitives that `seen` allows.
@@ -115,14 +161,20 @@ impl Scene {
         best
     }
 
-    /// Collects the shadow-casting primitives whose bounds `may_hide` does not exclude.
-    pub fn casters(&self, found: &mut Vec<u32>, may_hide: impl Fn(&Bounds) -> bool) {
+    /// Collects the primitives that may hide this light and whose bounds `may_hide` does not exclude.
+    pub fn casters(&self, light: Light, found: &mut Vec<u32>, may_hide: impl Fn(&Bounds) -> bool) {
         found.clear();
         self.walk(
-            |node, ()| node.casts_shadow && may_hide(&node.bounds),
+            |node, ()| {
+                let any = match light {
+                    Light::Lamp => node.hides_lamp,
+                    Light::Sky => node.hides_sky,
+                };
+                any && may_hide(&node.bounds)
+            },
             &mut (),
             |index, _| {
-                if self.primitives[index].casts_shadow {
+                if self.hides[index][light as usize] && may_hide(&self.bounds[index]) {
                     found.push(index as u32);
                 }
             },
@@ -167,7 +219,8 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
         bounds,
         start: offset,
         count: primitives.len() as u32,
-        casts_shadow: primitives.iter().any(|primitive| primitive.casts_shadow),
+        hides_lamp: primitives.iter().any(|primitive| primitive.hides(Light::Lamp)),
+        hides_sky: primitives.iter().any(|primitive| primitive.hides(Light::Sky)),
     });
     if primitives.len() <= LEAF {
         return;
@@ -190,15 +243,15 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
 }
 
 #[inline]
-fn enters(
-    bounds: &Bounds,
-    ray: &Ray,
-    inverse: &nalgebra::Vector3<f64>,
-    t_max: f64,
-) -> bool {
-    let low = (bounds.min - ray.origin).component_mul(inverse);
-    let high = (bounds.max - ray.origin).component_mul(inverse);
-    let (near, far) = (low.inf(&high), low.sup(&high));
+fn enters(bounds: &Bounds, ray: &Ray, inverse: &nalgebra::Vector3<f64>, t_max: f64) -> bool {
+    let (mut near, mut far) = (0.0, t_max);
+    for axis in 0..3 {
+        let one = (bounds.min[axis] - ray.origin[axis]) * inverse[axis];
+        let two = (bounds.max[axis] - ray.origin[axis]) * inverse[axis];
+        let (low, high) = if one < two { (one, two) } else { (two, one) };
+        near = if low > near { low } else { near };
+        far = if high < far { high } else { far };
+    }
     // A touch of slack, so that flat shapes are not lost to rounding.
-    near.max() <= far.min() + 1e-9 && far.min() > 0.0 && near.max() < t_max
+    near <= far + 1e-9
 }

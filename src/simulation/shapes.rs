@@ -45,6 +45,10 @@ impl Bounds {
         }
     }
 
+    pub fn contains(&self, point: &Point3<f64>) -> bool {
+        (0..3).all(|axis| (self.min[axis]..=self.max[axis]).contains(&point[axis]))
+    }
+
     pub fn center(&self) -> Point3<f64> {
         nalgebra::center(&self.min, &self.max)
     }

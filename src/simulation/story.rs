@@ -344,7 +344,7 @@ impl Story {
         let foot_of_item = item.placement.foot;
         let (grip_radius_m, grip_height) = item.kind.grip_m();
         let at_table = Point3::new(-0.90, foot_of_item.y + 0.2, 0.0);
-        let outside = at_table + Vector3::new(-1.0, -1.3, 0.0);
+        let outside = at_table + Vector3::new(-0.8, -0.9, 0.0);
         let shoulder = at_table + Vector3::new(0.25, -0.2, 0.0);
         let forward = Vector3::new(foot_of_item.x - shoulder.x, foot_of_item.y - shoulder.y, 0.0).normalize();
         let at_item = foot_of_item - forward * (grip_radius_m + 0.021) + Vector3::z() * grip_height;
@@ -360,8 +360,8 @@ impl Story {
             let x = x.clamp(0.0, 1.0);
             x * x * (3.0 - 2.0 * x)
         };
-        let walked = smooth(nearness / 0.45);
-        let reached = smooth((nearness - 0.30) / 0.70);
+        let walked = smooth(nearness / 0.28);
+        let reached = smooth((nearness - 0.18) / 0.72);
         let foot = outside + (at_table - outside) * walked;
         let resting = Person::resting_palm(foot) + Vector3::z() * 0.12;
         let lift = 0.10 * (std::f64::consts::PI * reached).sin();

@@ -5,11 +5,13 @@
 //! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
 //! One ray through each pixel's centre gives depth and object; edges and strong contrasts get four more for colour.
 
+use std::ops::Range;
+
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 use super::{
-    scene::{Finish, Hit, ObjectId, Primitive, Scene},
+    scene::{Finish, Hit, Light, ObjectId, Primitive, Scene},
     shapes::{Bounds, Ray},
     texture::{Rgb, Spot, mixed, rgb, scaled},
 };
@@ -18,14 +20,21 @@ use crate::model::{camera::Intrinsics, pose::Pose};
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
 const MAX_BOUNCES: u32 = 9;
-const LAMP_SAMPLES: usize = 16;
-const SKY_SAMPLES: usize = 8;
+const LAMP_SAMPLES: usize = 14;
+const SKY_SAMPLES: usize = 7;
+/// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
+const FEW_LAMP_SAMPLES: usize = 5;
+const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
 /// Contrast between neighbours (of the larger) above which a pixel is sampled again.
-const CONTRAST: f32 = 0.22;
+const CONTRAST: f32 = 0.5;
+/// The same between different surfaces of one object.
+const EDGE_CONTRAST: f32 = 0.12;
+/// Side of the squares of pixels that share one search for what may be seen or shade there.
+const TILE: usize = 8;
 
 /// A round lamp below the ceiling.
 #[derive(Debug, Clone)]
@@ -103,13 +112,97 @@ struct Path {
     spread: f64,
     /// Turns the sample patterns, 0..1.
     twist: f64,
+    /// One of several samples of its pixel.
+    few: bool,
 }
 
-struct Sample {
-    radiance: Rgb,
-    /// Distance along the ray, infinite for nothing.
-    t: f64,
-    primitive: Option<usize>,
+/// How much of the sky and of the lamp a point on a surface sees, 0..1. Light changes slowly over a surface, so
+/// neighbouring pixels on the same face of the same primitive share it.
+#[derive(Clone, Copy)]
+struct Lit {
+    /// Primitive and part.
+    face: (usize, usize),
+    sky: f32,
+    lamp: f32,
+}
+
+/// Nothing, or glass, which has no light of its own.
+const UNLIT: Lit = Lit {
+    face: (usize::MAX, 0),
+    sky: 1.0,
+    lamp: 1.0,
+};
+
+/// Lamp shares that differ by more are the edge of a shadow, where each pixel is looked at.
+const SHADOW_EDGE: f32 = 0.15;
+
+/// Pixels that a primitive's bounds cover, columns and rows, and how near they come.
+struct Footprint {
+    primitive: usize,
+    window: [Range<usize>; 2],
+    nearest_m: f64,
+}
+
+/// What matters in a square of pixels.
+struct Tile {
+    /// Primitives that may be seen there and the least distance at which they may be, nearest first.
+    seen: Vec<(usize, f64)>,
+    /// Holds every point seen through a pixel's centre.
+    reach: Bounds,
+    /// What may hide the lamp, or some of the sky, from points in `reach`.
+    lamp: Vec<u32>,
+    sky: Vec<u32>,
+}
+
+impl Tile {
+    fn over(
+        prints: &[Footprint],
+        columns: Range<usize>,
+        rows: Range<usize>,
+        may_be_seen: impl Fn(usize) -> bool,
+    ) -> Self {
+        let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
+        Self {
+            seen: prints
+                .iter()
+                .filter(|print| overlap(&print.window[0], &columns) && overlap(&print.window[1], &rows))
+                .filter(|print| may_be_seen(print.primitive))
+                .map(|print| (print.primitive, print.nearest_m))
+                .collect(),
+            reach: Bounds::EMPTY,
+            lamp: Vec::new(),
+            sky: Vec::new(),
+        }
+    }
+}
+
+/// All rays through a square of pixels and a pixel around it.
+struct Pyramid {
+    eye: Point3<f64>,
+    /// Of its four sides, pointing outwards.
+    normals: [Vector3<f64>; 4],
+}
+
+impl Pyramid {
+    fn over(camera: &Intrinsics, world_from_camera: &Pose, columns: Range<usize>, rows: Range<usize>) -> Self {
+        let (left, right) = (columns.start as f64 - 1.0, columns.end as f64);
+        let (top, bottom) = (rows.start as f64 - 1.0, rows.end as f64);
+        let corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+            .map(|(u, v)| world_from_camera.rotation * camera.unproject(u, v, 1.0).coords);
+        Self {
+            eye: Point3::from(world_from_camera.translation.vector),
+            normals: std::array::from_fn(|side| corners[(side + 1) % 4].cross(&corners[side])),
+        }
+    }
+
+    /// Never wrong if it says no.
+    fn may_hold(&self, bounds: &Bounds) -> bool {
+        let center = bounds.center() - self.eye;
+        let half = bounds.half();
+        self.normals
+            .iter()
+            .all(|normal| normal.dot(&center) <= normal.abs().dot(&half))
+    }
 }
 
 /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
@@ -155,12 +248,17 @@ fn times(a: Rgb, b: Rgb) -> Rgb {
     std::array::from_fn(|i| a[i] * b[i])
 }
 
-/// Points spread evenly over the unit disc: a sunflower's seeds.
-fn seed_point(index: usize, count: usize, twist: f64) -> (f64, f64) {
+/// Points spread evenly over the unit disc: a sunflower's seeds, turned by `twist` of a full turn.
+fn seed_points<const N: usize>(twist: f64) -> [(f64, f64); N] {
     const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
-    let radius = ((index as f64 + 0.5) / count as f64).sqrt();
-    let (sin, cos) = (index as f64 * GOLDEN_ANGLE + twist * std::f64::consts::TAU).sin_cos();
-    (radius * cos, radius * sin)
+    let (step_sin, step_cos) = GOLDEN_ANGLE.sin_cos();
+    let (mut sin, mut cos) = (twist * std::f64::consts::TAU).sin_cos();
+    std::array::from_fn(|index| {
+        let radius = ((index as f64 + 0.5) / N as f64).sqrt();
+        let point = (radius * cos, radius * sin);
+        (sin, cos) = (sin * step_cos + cos * step_sin, cos * step_cos - sin * step_sin);
+        point
+    })
 }
 
 fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
@@ -178,60 +276,81 @@ fn twist_of(column: usize, row: usize) -> f64 {
 impl Tracer<'_> {
     /// Renders what a camera sees.
     pub fn render(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Rendering {
-        let Intrinsics { width, height, .. } = *camera;
+        let width = camera.width;
         let pixels = camera.pixels();
-        let spread = 1.0 / camera.fx;
+        let prints = self.footprints(camera, world_from_camera);
         let mut rendering = Rendering {
             radiance: vec![[0.0; 3]; pixels],
             depth_m: vec![0.0; pixels],
             depth_through_glass_m: vec![0.0; pixels],
             object: vec![ObjectId::ROOM; pixels],
         };
-        let mut surface = vec![usize::MAX; pixels];
-        let path = |u: f64, v: f64, twist: f64| {
+        let mut lit = vec![UNLIT; pixels];
+        let path = |u: f64, v: f64, twist: f64, few: bool| {
             let (ray, cos) = camera_ray(camera, world_from_camera, u, v);
             let path = Path {
                 ray,
                 bounces: 0,
                 travelled: 0.0,
-                spread,
+                spread: 1.0 / camera.fx,
                 twist,
+                few,
             };
             (path, cos)
         };
-        rendering
+        let bands: Vec<Vec<Tile>> = rendering
             .radiance
-            .par_chunks_mut(width)
-            .zip(rendering.depth_m.par_chunks_mut(width))
-            .zip(rendering.depth_through_glass_m.par_chunks_mut(width))
-            .zip(rendering.object.par_chunks_mut(width))
-            .zip(surface.par_chunks_mut(width))
+            .par_chunks_mut(width * TILE)
+            .zip(rendering.depth_m.par_chunks_mut(width * TILE))
+            .zip(rendering.depth_through_glass_m.par_chunks_mut(width * TILE))
+            .zip(rendering.object.par_chunks_mut(width * TILE))
+            .zip(lit.par_chunks_mut(width * TILE))
             .enumerate()
-            .for_each_init(
+            .map_init(
                 Scratch::default,
-                |scratch, (row, ((((radiance, depth), through), object), surface))| {
-                    for column in 0..width {
-                        let (path, cos) =
-                            path(column as f64, row as f64, twist_of(column, row));
-                        let sample = self.trace(&path, scratch);
-                        radiance[column] = sample.radiance;
-                        let Some(primitive) = sample.primitive else {
-                            continue;
-                        };
-                        let seen = &self.scene.primitives()[primitive];
-                        depth[column] = (sample.t * cos) as f32;
-                        object[column] = seen.object;
-                        surface[column] = primitive;
-                        through[column] = if seen.is_glass() {
-                            self.scene
-                                .nearest(&path.ray, sample.t, f64::INFINITY, |p| !p.is_glass())
-                                .map_or(0.0, |hit| (hit.crossing.t * cos) as f32)
-                        } else {
-                            depth[column]
-                        };
+                |scratch, (band, ((((radiance, depth), through), object), lit))| {
+                    let top = band * TILE;
+                    let height = radiance.len() / width;
+                    let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
+                    for left in (0..width).step_by(TILE) {
+                        let right = (left + TILE).min(width);
+                        let frame = Pyramid::over(camera, world_from_camera, left..right, top..top + height);
+                        let mut tile = Tile::over(&prints, left..right, top..top + height, |primitive| {
+                            frame.may_hold(&self.scene.bounds()[primitive])
+                        });
+                        let mut seen = Vec::with_capacity(TILE * TILE);
+                        for row in 0..height {
+                            for column in left..right {
+                                let (u, v) = (column, top + row);
+                                let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
+                                let hit = self.first(&path.ray, &tile);
+                                seen.push((row * width + column, path, cos, hit));
+                            }
+                        }
+                        self.look_around(&mut tile, &seen);
+                        self.light(&tile, &seen, lit, width, scratch);
+                        for (at, path, cos, hit) in seen {
+                            radiance[at] = self.shade(&path, hit.as_ref(), Some(lit[at]), None, scratch);
+                            let Some(hit) = hit else {
+                                continue;
+                            };
+                            let primitive = &self.scene.primitives()[hit.primitive];
+                            depth[at] = (hit.crossing.t * cos) as f32;
+                            object[at] = primitive.object;
+                            through[at] = if primitive.is_glass() {
+                                self.scene
+                                    .nearest(&path.ray, hit.crossing.t, f64::INFINITY, |p| !p.is_glass())
+                                    .map_or(0.0, |hit| (hit.crossing.t * cos) as f32)
+                            } else {
+                                depth[at]
+                            };
+                        }
+                        tiles.push(tile);
                     }
+                    tiles
                 },
-            );
+            )
+            .collect();
         let first = rendering.radiance.clone();
         rendering
             .radiance
@@ -239,21 +358,18 @@ impl Tracer<'_> {
             .enumerate()
             .for_each_init(Scratch::default, |scratch, (row, radiance)| {
                 for (column, radiance) in radiance.iter_mut().enumerate() {
-                    let here = row * width + column;
-                    let rough = [
-                        (column > 0).then(|| here - 1),
-                        (column + 1 < width).then_some(here + 1),
-                        (row > 0).then(|| here - width),
-                        (row + 1 < height).then_some(here + width),
-                    ]
-                    .into_iter()
-                    .flatten()
-                    .any(|there| {
-                        surface[here] != surface[there] || contrast(first[here], first[there])
-                    });
-                    if !rough {
+                    if !rough(camera, &rendering.object, &lit, &first, column, row) {
                         continue;
                     }
+                    let here = row * width + column;
+                    let around = [
+                        Some(here),
+                        (column > 0).then(|| here - 1),
+                        (column + 1 < width).then_some(here + 1),
+                        (row > 0).then(|| here.wrapping_sub(width)),
+                        (row + 1 < camera.height).then_some(here + width),
+                    ];
+                    let tile = &bands[row / TILE][column / TILE];
                     let mut sum = scaled(*radiance, 0.2);
                     for (index, (du, dv)) in
                         [(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)]
@@ -261,8 +377,17 @@ impl Tracer<'_> {
                             .enumerate()
                     {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
-                        let (path, _) = path(column as f64 + du, row as f64 + dv, twist);
-                        sum = plus(sum, scaled(self.trace(&path, scratch).radiance, 0.2));
+                        let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
+                        let hit = self.first(&path.ray, tile);
+                        let known = hit.and_then(|hit| {
+                            around
+                                .into_iter()
+                                .flatten()
+                                .map(|there| lit[there])
+                                .find(|lit| lit.face == (hit.primitive, hit.crossing.part))
+                        });
+                        let colour = self.shade(&path, hit.as_ref(), known, Some(tile), scratch);
+                        sum = plus(sum, scaled(colour, 0.2));
                     }
                     *radiance = sum;
                 }
@@ -270,23 +395,207 @@ impl Tracer<'_> {
         rendering
     }
 
-    fn trace(&self, path: &Path, scratch: &mut Scratch) -> Sample {
-        let Some(hit) = self.scene.nearest(&path.ray, LIFT, f64::INFINITY, |_| true) else {
-            return Sample {
-                radiance: self.surroundings(&path.ray.direction),
-                t: f64::INFINITY,
-                primitive: None,
+    /// Where each primitive can be seen in the image at all, nearest first.
+    fn footprints(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Vec<Footprint> {
+        let camera_from_world = world_from_camera.inverse();
+        let eye = Point3::from(world_from_camera.translation.vector);
+        let mut prints: Vec<_> = self
+            .scene
+            .bounds()
+            .iter()
+            .enumerate()
+            .map(|(primitive, bounds)| Footprint {
+                primitive,
+                window: window_of(bounds, camera, &camera_from_world),
+                nearest_m: (eye.sup(&bounds.min).inf(&bounds.max) - eye).norm(),
+            })
+            .filter(|print| print.window.iter().all(|range| !range.is_empty()))
+            .collect();
+        prints.sort_by(|a, b| a.nearest_m.total_cmp(&b.nearest_m));
+        prints
+    }
+
+    /// The nearest hit of a ray through the tile.
+    fn first(&self, ray: &Ray, tile: &Tile) -> Option<Hit> {
+        let mut best: Option<Hit> = None;
+        let mut t_max = f64::INFINITY;
+        for &(primitive, nearest_m) in &tile.seen {
+            if nearest_m > t_max {
+                break;
+            }
+            let shape = &self.scene.primitives()[primitive].shape;
+            if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
+                t_max = crossing.t;
+                best = Some(Hit {
+                    crossing,
+                    primitive,
+                });
+            }
+        }
+        best
+    }
+
+    /// Finds what may shade any of the points that a tile sees.
+    fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
+        tile.reach = Bounds::of(
+            seen.iter()
+                .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
+        );
+        if tile.reach.min.x > tile.reach.max.x {
+            return;
+        }
+        // Room for the further samples of its pixels.
+        let spare = Vector3::from_element(2e-3);
+        tile.reach.min -= spare;
+        tile.reach.max += spare;
+        let center = tile.reach.center();
+        let half = tile.reach.half();
+        let lamp = &self.lighting.lamp;
+        let axis = lamp.center - center;
+        let length = axis.norm();
+        let direction = axis / length;
+        self.scene.casters(Light::Lamp, &mut tile.lamp, |bounds| {
+            let grown = Bounds {
+                min: bounds.min - half,
+                max: bounds.max + half,
             };
+            in_beam(&grown, &center, &direction, length, lamp.radius)
+        });
+        self.scene.casters(Light::Sky, &mut tile.sky, |bounds| {
+            let apart = (bounds.center() - center).abs() - bounds.half() - half;
+            apart.max() < SKY_REACH
+        });
+    }
+
+    /// Finds the light on every point that a tile sees: exactly at every fourth pixel, between them where it matters.
+    fn light(
+        &self,
+        tile: &Tile,
+        seen: &[(usize, Path, f64, Option<Hit>)],
+        lit: &mut [Lit],
+        width: usize,
+        scratch: &mut Scratch,
+    ) {
+        let sparse = |at: usize| (at % width).is_multiple_of(2) && (at / width).is_multiple_of(2);
+        for &(at, ref path, _, hit) in seen.iter().filter(|&&(at, ..)| sparse(at)) {
+            if let Some(hit) = hit {
+                lit[at] = self.light_on(path, &hit, Some(tile), scratch);
+            }
+        }
+        let (first, last) = match (seen.first(), seen.last()) {
+            (Some(first), Some(last)) => (first.0, last.0),
+            _ => return,
+        };
+        let columns = first % width..=last % width;
+        let rows = first / width..=last / width;
+        for &(at, ref path, _, hit) in seen.iter().filter(|&&(at, ..)| !sparse(at)) {
+            let Some(hit) = hit else {
+                continue;
+            };
+            let face = (hit.primitive, hit.crossing.part);
+            let (column, row) = (at % width, at / width);
+            let (mut count, mut sky, mut low, mut high, mut lamp) = (0.0, 0.0, 1.0f32, 0.0f32, 0.0);
+            for row in row.saturating_sub(1)..=row + 1 {
+                for column in column.saturating_sub(1)..=column + 1 {
+                    let there = row * width + column;
+                    if columns.contains(&column)
+                        && rows.contains(&row)
+                        && sparse(there)
+                        && lit[there].face == face
+                    {
+                        count += 1.0;
+                        sky += lit[there].sky;
+                        lamp += lit[there].lamp;
+                        low = low.min(lit[there].lamp);
+                        high = high.max(lit[there].lamp);
+                    }
+                }
+            }
+            lit[at] = if count > 0.0 && high - low < SHADOW_EDGE {
+                Lit {
+                    face,
+                    sky: sky / count,
+                    lamp: lamp / count,
+                }
+            } else {
+                self.light_on(path, &hit, Some(tile), scratch)
+            };
+        }
+    }
+
+    fn light_on(&self, path: &Path, hit: &Hit, tile: Option<&Tile>, scratch: &mut Scratch) -> Lit {
+        let primitive = &self.scene.primitives()[hit.primitive];
+        if primitive.is_glass() {
+            return UNLIT;
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let surface = primitive.shape.surface(&point, hit.crossing.part);
+        let facing = path.ray.direction.dot(&surface.normal) < 0.0;
+        let normal = if facing { surface.normal } else { -surface.normal };
+        let own = (!primitive.hollow).then_some(hit.primitive as u32);
+        // Seen in a mirror or through glass, fewer samples do.
+        let few = path.few || path.bounces > 0;
+        let sky = if few { Self::sky_share::<FEW_SKY_SAMPLES> } else { Self::sky_share::<SKY_SAMPLES> };
+        let lamp = if few { Self::lamp_share::<FEW_LAMP_SAMPLES> } else { Self::lamp_share::<LAMP_SAMPLES> };
+        Lit {
+            face: (hit.primitive, hit.crossing.part),
+            sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
+            lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
+                lamp(self, &point, own, path.twist, tile, scratch)
+            } else {
+                0.0
+            },
+        }
+    }
+
+    /// What may hide a light from a point: from the tile's choice if the point is among those it was made for.
+    fn casters_at(
+        &self,
+        light: Light,
+        point: &Point3<f64>,
+        tile: Option<&Tile>,
+        found: &mut Vec<u32>,
+        may_hide: impl Fn(&Bounds) -> bool,
+    ) {
+        match tile.filter(|tile| tile.reach.contains(point)) {
+            Some(tile) => {
+                let list = match light {
+                    Light::Lamp => &tile.lamp,
+                    Light::Sky => &tile.sky,
+                };
+                found.clear();
+                found.extend(
+                    list.iter()
+                        .filter(|&&index| may_hide(&self.scene.bounds()[index as usize])),
+                );
+            }
+            None => self.scene.casters(light, found, may_hide),
+        }
+    }
+
+    fn trace(&self, path: &Path, scratch: &mut Scratch) -> Rgb {
+        let hit = self.scene.nearest(&path.ray, LIFT, f64::INFINITY, |_| true);
+        self.shade(path, hit.as_ref(), None, None, scratch)
+    }
+
+    fn shade(
+        &self,
+        path: &Path,
+        hit: Option<&Hit>,
+        lit: Option<Lit>,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> Rgb {
+        let Some(hit) = hit else {
+            return self.surroundings(&path.ray.direction);
         };
         let primitive = &self.scene.primitives()[hit.primitive];
-        let radiance = match primitive.material.finish {
-            Finish::Glass { index } => self.glass(path, &hit, primitive, index, scratch),
-            finish => self.opaque(path, &hit, primitive, finish, scratch),
-        };
-        Sample {
-            radiance,
-            t: hit.crossing.t,
-            primitive: Some(hit.primitive),
+        match primitive.material.finish {
+            Finish::Glass { index } => self.glass(path, hit, primitive, index, scratch),
+            finish => {
+                let lit = lit.unwrap_or_else(|| self.light_on(path, hit, tile, scratch));
+                self.opaque(path, hit, primitive, finish, lit, scratch)
+            }
         }
     }
 
@@ -341,16 +650,16 @@ impl Tracer<'_> {
         };
         let reflection = mirrored(&direction, &normal);
         let Some(transmission) = refracted(&direction, &normal, ratio) else {
-            return self.trace(&onward(reflection), scratch).radiance;
+            return self.trace(&onward(reflection), scratch);
         };
         let share = fresnel(-direction.dot(&normal), -transmission.dot(&normal), ratio);
-        let through = scaled(self.trace(&onward(transmission), scratch).radiance, 0.985 * (1.0 - share));
+        let through = scaled(self.trace(&onward(transmission), scratch), 0.985 * (1.0 - share));
         // Reflections inside the wall are many and faint: followed only where they are the view itself.
         if path.bounces > 1 || !entering {
             return plus(through, scaled(self.surroundings(&reflection), share));
         }
         let reflected = plus(
-            self.trace(&onward(reflection), scratch).radiance,
+            self.trace(&onward(reflection), scratch),
             self.highlights(&point, &reflection, 0.08),
         );
         plus(through, scaled(reflected, share))
@@ -362,6 +671,7 @@ impl Tracer<'_> {
         hit: &Hit,
         primitive: &Primitive,
         finish: Finish,
+        lit: Lit,
         scratch: &mut Scratch,
     ) -> Rgb {
         let direction = path.ray.direction;
@@ -378,20 +688,19 @@ impl Tracer<'_> {
             // Between the short and the long side of the pixel's oblique print.
             footprint: travelled * path.spread / cos.max(0.1).sqrt(),
         });
-        let own = (!primitive.hollow).then_some(hit.primitive as u32);
-        // Seen in a mirror or through glass, fewer samples do.
-        let effort = if path.bounces > 1 { 4 } else { 1 };
-        let mut light = self.sky(&point, &normal, own, path.twist, effort, scratch);
-        let lamp = &self.lighting.lamp;
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        let sky = plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        );
+        let lamp = &lighting.lamp;
         let to_lamp = lamp.center - point;
         let distance = to_lamp.norm();
-        let facing = normal.dot(&to_lamp) / distance;
-        let mut lit = 0.0;
-        if facing > 0.0 {
-            lit = self.lamp_share(&point, own, path.twist, effort, scratch);
-            let falloff = (lamp.reference_m / distance).powi(2) * facing;
-            light = plus(light, scaled(lamp.irradiance, lit * falloff as f32));
-        }
+        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
+        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
+        let light = plus(scaled(sky, lit.sky), scaled(lamp.irradiance, lit.lamp * falloff));
         let diffuse = times(colour, light);
         let Finish::Glossy {
             reflectance,
@@ -416,14 +725,13 @@ impl Tracer<'_> {
                 },
                 scratch,
             )
-            .radiance
         } else {
             self.surroundings(&reflection)
         };
         let softness = 2.0 / f64::from(sharpness).sqrt();
         let highlights = scaled(
             self.highlights(&point, &reflection, softness),
-            (0.25 + 0.75 * lit) * (sharpness / 300.0).min(1.0),
+            (0.25 + 0.75 * lit.lamp) * (sharpness / 300.0).min(1.0),
         );
         plus(
             scaled(diffuse, 1.0 - share),
@@ -431,25 +739,18 @@ impl Tracer<'_> {
         )
     }
 
-    /// Irradiance from all around, less what near things take away.
-    fn sky(
+    /// Share of the sky that near things leave to the point, 0..1.
+    fn sky_share<const SAMPLES: usize>(
         &self,
         point: &Point3<f64>,
         normal: &Vector3<f64>,
         own: Option<u32>,
         twist: f64,
-        effort: usize,
+        tile: Option<&Tile>,
         scratch: &mut Scratch,
-    ) -> Rgb {
-        let up = (0.5 + 0.5 * normal.z) as f32;
-        let (towards, window) = &self.lighting.window;
-        let from_window = normal.dot(towards).max(0.0) as f32;
-        let light = plus(
-            mixed(self.lighting.ground, self.lighting.sky, up),
-            scaled(*window, from_window),
-        );
+    ) -> f32 {
         let center = point + normal * (SKY_REACH * 0.5);
-        self.scene.casters(&mut scratch.casters, |bounds| {
+        self.casters_at(Light::Sky, point, tile, &mut scratch.casters, |bounds| {
             let nearest = center.sup(&bounds.min).inf(&bounds.max);
             (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
                 // Not wholly behind the surface.
@@ -457,13 +758,11 @@ impl Tracer<'_> {
         });
         scratch.casters.retain(|&index| Some(index) != own);
         if scratch.casters.is_empty() {
-            return light;
+            return 1.0;
         }
         let (right, forward) = basis(normal);
-        let samples = (SKY_SAMPLES / effort).max(4);
         let mut hidden = 0.0;
-        for index in 0..samples {
-            let (x, y) = seed_point(index, samples, twist);
+        for (x, y) in seed_points::<SAMPLES>(twist) {
             let direction =
                 right * x + forward * y + normal * (1.0 - x * x - y * y).max(0.0).sqrt();
             let ray = Ray {
@@ -473,32 +772,29 @@ impl Tracer<'_> {
             let mut nearest = SKY_REACH;
             for &caster in &scratch.casters {
                 let primitive = &self.scene.primitives()[caster as usize];
-                if primitive.is_glass() {
-                    continue;
-                }
                 if let Some(crossing) = primitive.shape.crossing(&ray, LIFT, nearest) {
                     nearest = crossing.t;
                 }
             }
             hidden += 1.0 - (nearest / SKY_REACH) as f32;
         }
-        scaled(light, 1.0 - 0.9 * hidden / samples as f32)
+        1.0 - 0.9 * hidden / SAMPLES as f32
     }
 
     /// Share of the lamp that the point sees, 0..1.
-    fn lamp_share(
+    fn lamp_share<const SAMPLES: usize>(
         &self,
         point: &Point3<f64>,
         own: Option<u32>,
         twist: f64,
-        effort: usize,
+        tile: Option<&Tile>,
         scratch: &mut Scratch,
     ) -> f32 {
         let lamp = &self.lighting.lamp;
         let axis = lamp.center - point;
         let length = axis.norm();
         let direction = axis / length;
-        self.scene.casters(&mut scratch.casters, |bounds| {
+        self.casters_at(Light::Lamp, point, tile, &mut scratch.casters, |bounds| {
             in_beam(bounds, point, &direction, length, lamp.radius)
         });
         scratch.casters.retain(|&index| Some(index) != own);
@@ -506,10 +802,8 @@ impl Tracer<'_> {
             return 1.0;
         }
         let (right, forward) = basis(&direction);
-        let samples = LAMP_SAMPLES / effort;
         let mut seen = 0.0;
-        for index in 0..samples {
-            let (x, y) = seed_point(index, samples, twist);
+        for (x, y) in seed_points::<SAMPLES>(twist) {
             let offset = axis + (right * x + forward * y) * lamp.radius;
             let distance = offset.norm();
             let ray = Ray {
@@ -528,12 +822,33 @@ impl Tracer<'_> {
             }
             seen += share;
         }
-        seen / samples as f32
+        seen / SAMPLES as f32
     }
 }
 
-fn contrast(a: Rgb, b: Rgb) -> bool {
-    (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
+/// Does a pixel differ from one of its neighbours in surface, or strongly in colour?
+fn rough(
+    camera: &Intrinsics,
+    object: &[ObjectId],
+    lit: &[Lit],
+    radiance: &[Rgb],
+    column: usize,
+    row: usize,
+) -> bool {
+    let width = camera.width;
+    let here = row * width + column;
+    let differs = |there: usize| {
+        let (a, b) = (radiance[here], radiance[there]);
+        let contrast = (0..3)
+            .map(|i| (a[i] - b[i]).abs() / a[i].max(b[i]).max(0.05))
+            .fold(0.0, f32::max);
+        let same_face = lit[here].face == lit[there].face;
+        object[here] != object[there] || contrast > if same_face { CONTRAST } else { EDGE_CONTRAST }
+    };
+    (column > 0 && differs(here - 1))
+        || (column + 1 < width && differs(here + 1))
+        || (row > 0 && differs(here - width))
+        || (row + 1 < camera.height && differs(here + width))
 }
 
 /// May something in these bounds hide a part of a lamp of this radius, `length` away in `direction`? Never wrong if it
@@ -571,9 +886,10 @@ fn in_beam(
 /// silhouette of an object that stands, or would stand, in the scene.
 pub fn depth_alone(primitives: &[Primitive], camera: &Intrinsics, world_from_camera: &Pose) -> Vec<f32> {
     let mut depth = vec![f32::INFINITY; camera.pixels()];
-    let Some((columns, rows)) = window_of(primitives, camera, world_from_camera) else {
-        return depth;
-    };
+    let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&primitive.shape.bounds())
+    });
+    let [columns, rows] = window_of(&bounds, camera, &world_from_camera.inverse());
     for row in rows {
         for column in columns.clone() {
             let (ray, cos) = camera_ray(camera, world_from_camera, column as f64, row as f64);
@@ -588,35 +904,31 @@ pub fn depth_alone(primitives: &[Primitive], camera: &Intrinsics, world_from_cam
     depth
 }
 
-/// Pixels that the primitives' bounds can reach; the whole image if part of them is behind the camera.
-fn window_of(
-    primitives: &[Primitive],
-    camera: &Intrinsics,
-    world_from_camera: &Pose,
-) -> Option<(std::ops::Range<usize>, std::ops::Range<usize>)> {
-    let bounds = primitives
-        .iter()
-        .map(|primitive| primitive.shape.bounds())
-        .reduce(|a, b| a.joined(&b))?;
-    let camera_from_world = world_from_camera.inverse();
+/// Columns and rows that something in these bounds can reach, with a pixel to spare; the whole image if a part of it is
+/// behind the camera.
+fn window_of(bounds: &Bounds, camera: &Intrinsics, camera_from_world: &Pose) -> [Range<usize>; 2] {
+    let size = [camera.width, camera.height];
     let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
+    let mut behind = 0;
     for corner in 0..8 {
         let pick = |axis: usize| {
             if corner >> axis & 1 == 0 { bounds.min[axis] } else { bounds.max[axis] }
         };
         let in_camera = camera_from_world * Point3::new(pick(0), pick(1), pick(2));
-        let Some((u, v)) = (in_camera.z > 1e-3)
-            .then(|| camera.project(&in_camera))
-            .flatten()
-        else {
-            return Some((0..camera.width, 0..camera.height));
-        };
-        low = [low[0].min(u), low[1].min(v)];
-        high = [high[0].max(u), high[1].max(v)];
+        if in_camera.z < 1e-3 {
+            behind += 1;
+        } else if let Some((u, v)) = camera.project(&in_camera) {
+            low = [low[0].min(u), low[1].min(v)];
+            high = [high[0].max(u), high[1].max(v)];
+        }
     }
-    // The casts saturate: a box outside of the image gives an empty range.
-    let range = |axis: usize, size: usize| {
-        (low[axis].floor().max(0.0) as usize).min(size)..((high[axis].ceil() + 1.0).max(0.0) as usize).min(size)
-    };
-    Some((range(0, camera.width), range(1, camera.height)))
+    match behind {
+        // The casts saturate: what is beside the image gets an empty range.
+        0 => [0, 1].map(|axis| {
+            ((low[axis] - 1.0).max(0.0) as usize).min(size[axis])
+                ..((high[axis] + 2.0).max(0.0) as usize).min(size[axis])
+        }),
+        8 => [0..0, 0..0],
+        _ => size.map(|size| 0..size),
+    }
 }
