@@ -90,14 +90,22 @@ fn hash(x: i64, y: i64, seed: u32) -> f32 {
 }
 
 /// Value noise of period 1, -1..1.
+#[inline]
 fn noise(x: f64, y: f64, seed: u32) -> f32 {
-    let (column, row) = (x.floor(), y.floor());
-    let (i, j) = (column as i64, row as i64);
+    let (i, j) = (floor(x), floor(y));
+    let (column, row) = (i as f64, j as f64);
     let smooth = |t: f32| t * t * (3.0 - 2.0 * t);
     let (s, t) = (smooth((x - column) as f32), smooth((y - row) as f32));
     let top = hash(i, j, seed) * (1.0 - s) + hash(i + 1, j, seed) * s;
     let bottom = hash(i, j + 1, seed) * (1.0 - s) + hash(i + 1, j + 1, seed) * s;
     (top * (1.0 - t) + bottom * t) * 2.0 - 1.0
+}
+
+/// Without SSE4.1, `f64::floor` is a call into the C library.
+#[inline]
+fn floor(x: f64) -> i64 {
+    let whole = x as i64;
+    whole - i64::from(x < whole as f64)
 }
 
 /// How much of a detail of this size survives a pixel of that footprint, 0..1.
@@ -140,12 +148,17 @@ fn stripes(x: f64, footprint: f64, seed: u32) -> f32 {
         (0.156, 0.161, 0.90),
         (0.186, 0.191, 0.40),
     ];
-    let turn = (x / PERIOD).floor();
-    let inside = x - turn * PERIOD;
+    let turn = floor(x / PERIOD);
+    let inside = x - turn as f64 * PERIOD;
     LINES
         .iter()
-        .map(|&(low, high, strength)| {
-            let shift = f64::from(hash(turn as i64, (low * 1e3) as i64, seed) - 0.5) * 0.012;
+        .zip(0..)
+        // A line is shifted by 6 mm at most.
+        .filter(|((low, high, _), _)| {
+            inside > low - 0.006 - footprint && inside < high + 0.006 + footprint
+        })
+        .map(|(&(low, high, strength), line)| {
+            let shift = f64::from(hash(turn, line, seed) - 0.5) * 0.012;
             strength * between(inside, low + shift, high + shift, footprint)
         })
         .sum::<f32>()
@@ -159,17 +172,18 @@ impl Pattern {
         match self {
             Self::Plain(colour) => *colour,
             Self::Cloth { ground, warp, weft, seed } => {
-                let fold = f64::from(clouds(u, v, 0.11, 2, footprint, seed + 9)) * 0.004;
+                let fold = f64::from(clouds(u, v, 0.11, 1, footprint, seed + 9)) * 0.004;
                 let along = stripes(u + fold, footprint, *seed);
                 let across = stripes(v + fold * 0.7 + 0.05, footprint, seed + 1);
                 let colour = mixed(mixed(*ground, *warp, along * 0.8), *weft, across * 0.62);
                 // Embroidered dots in some of the tartan's fields.
-                let (column, row) = ((u / 0.07).floor(), (v / 0.07).floor());
-                let chosen = hash(column as i64, row as i64, seed + 4);
+                let (i, j) = (floor(u / 0.07), floor(v / 0.07));
+                let (column, row) = (i as f64, j as f64);
+                let chosen = hash(i, j, seed + 4);
                 let colour = if chosen > 0.55 {
                     let du = u - (column + 0.3 + f64::from(chosen) * 0.4) * 0.07;
                     let dv = v - (row + 0.5) * 0.07;
-                    let radius = du.hypot(dv);
+                    let radius = (du * du + dv * dv).sqrt();
                     let petal = 0.009 + 0.004 * (5.0 * dv.atan2(du)).cos();
                     let figure = 1.0 - above(radius, petal, footprint);
                     let heart = 1.0 - above(radius, 0.004, footprint);

@@ -29,6 +29,10 @@ const FEW_SKY_SAMPLES: usize = 3;
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
+/// Mirrored light of a smaller part in the pixel is taken from the room at large.
+const FAINT: f32 = 0.045;
+/// Of a smaller part in the pixel, shadows are not looked for.
+const WEAK: f32 = 0.3;
 /// Contrast between neighbours (of the larger) above which a pixel is sampled again.
 const CONTRAST: f32 = 0.5;
 /// The same between different surfaces of one object.
@@ -114,6 +118,8 @@ struct Path {
     twist: f64,
     /// One of several samples of its pixel.
     few: bool,
+    /// Its part in the pixel, 0..1.
+    weight: f32,
 }
 
 /// How much of the sky and of the lamp a point on a surface sees, 0..1. Light changes slowly over a surface, so
@@ -295,6 +301,7 @@ impl Tracer<'_> {
                 spread: 1.0 / camera.fx,
                 twist,
                 few,
+                weight: 1.0,
             };
             (path, cos)
         };
@@ -528,6 +535,13 @@ impl Tracer<'_> {
         if primitive.is_glass() {
             return UNLIT;
         }
+        if path.weight < WEAK {
+            return Lit {
+                face: (hit.primitive, hit.crossing.part),
+                sky: 0.85,
+                lamp: 0.8,
+            };
+        }
         let point = path.ray.at(hit.crossing.t);
         let surface = primitive.shape.surface(&point, hit.crossing.part);
         let facing = path.ray.direction.dot(&surface.normal) < 0.0;
@@ -639,27 +653,28 @@ impl Tracer<'_> {
         if path.bounces >= MAX_BOUNCES {
             return self.surroundings(&direction);
         }
-        let onward = |direction: Vector3<f64>| Path {
+        let onward = |direction: Vector3<f64>, share: f32| Path {
             ray: Ray {
                 origin: point,
                 direction,
             },
             bounces: path.bounces + 1,
             travelled: path.travelled + hit.crossing.t,
+            weight: path.weight * share,
             ..*path
         };
         let reflection = mirrored(&direction, &normal);
         let Some(transmission) = refracted(&direction, &normal, ratio) else {
-            return self.trace(&onward(reflection), scratch);
+            return self.trace(&onward(reflection, 1.0), scratch);
         };
         let share = fresnel(-direction.dot(&normal), -transmission.dot(&normal), ratio);
-        let through = scaled(self.trace(&onward(transmission), scratch), 0.985 * (1.0 - share));
+        let through = scaled(self.trace(&onward(transmission, 1.0 - share), scratch), 0.985 * (1.0 - share));
         // Reflections inside the wall are many and faint: followed only where they are the view itself.
         if path.bounces > 1 || !entering {
             return plus(through, scaled(self.surroundings(&reflection), share));
         }
         let reflected = plus(
-            self.trace(&onward(reflection), scratch),
+            self.trace(&onward(reflection, share), scratch),
             self.highlights(&point, &reflection, 0.08),
         );
         plus(through, scaled(reflected, share))
@@ -711,7 +726,7 @@ impl Tracer<'_> {
         };
         let share = reflectance + (1.0 - reflectance) * (1.0 - cos as f32).powi(5) * (sharpness / 200.0).min(1.0);
         let reflection = mirrored(&direction, &normal);
-        let seen = if path.bounces < 2 {
+        let seen = if path.bounces < 2 && path.weight * share > FAINT {
             self.trace(
                 &Path {
                     ray: Ray {
@@ -721,6 +736,7 @@ impl Tracer<'_> {
                     bounces: path.bounces + 2,
                     travelled,
                     spread: path.spread * 3.0,
+                    weight: path.weight * share,
                     ..*path
                 },
                 scratch,
