@@ -186,6 +186,11 @@ pub struct Solid {
 }
 
 impl Solid {
+    /// Outward normal and offset of each face: inside is `normal . p <= offset`.
+    pub fn planes(&self) -> &[(Vector3<f64>, f64)] {
+        &self.planes
+    }
+
     /// A box standing on `origin` (the middle of its base), `size` along its own axes, turned about z.
     pub fn cuboid(origin: Point3<f64>, size: Vector3<f64>, yaw_rad: f64) -> Self {
         let (right, forward) = turned_axes(yaw_rad);

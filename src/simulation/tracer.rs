@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use super::{
     scene::{Finish, Hit, Light, ObjectId, Primitive, Scene},
-    shapes::{Bounds, Ray},
+    shapes::{Bounds, Ray, Shape},
     texture::{Rgb, Spot, mixed, rgb, scaled},
 };
 use crate::model::{camera::Intrinsics, pose::Pose};
@@ -33,10 +33,8 @@ const GLASS_SHADOW: f32 = 0.9;
 const FAINT: f32 = 0.045;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
-/// Contrast between neighbours (of the larger) above which a pixel is sampled again.
-const CONTRAST: f32 = 0.5;
-/// The same between different surfaces of one object.
-const EDGE_CONTRAST: f32 = 0.12;
+/// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
+const CONTRAST: f32 = 0.12;
 /// Side of the squares of pixels that share one search for what may be seen or shade there.
 const TILE: usize = 8;
 
@@ -165,16 +163,17 @@ impl Tile {
         prints: &[Footprint],
         columns: Range<usize>,
         rows: Range<usize>,
-        may_be_seen: impl Fn(usize) -> bool,
+        nearest_m: impl Fn(&Footprint) -> Option<f64>,
     ) -> Self {
         let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
+        let mut seen: Vec<_> = prints
+            .iter()
+            .filter(|print| overlap(&print.window[0], &columns) && overlap(&print.window[1], &rows))
+            .filter_map(|print| Some((print.primitive, nearest_m(print)?)))
+            .collect();
+        seen.sort_by(|a, b| a.1.total_cmp(&b.1));
         Self {
-            seen: prints
-                .iter()
-                .filter(|print| overlap(&print.window[0], &columns) && overlap(&print.window[1], &rows))
-                .filter(|print| may_be_seen(print.primitive))
-                .map(|print| (print.primitive, print.nearest_m))
-                .collect(),
+            seen,
             reach: Bounds::EMPTY,
             lamp: Vec::new(),
             sky: Vec::new(),
@@ -185,6 +184,8 @@ impl Tile {
 /// All rays through a square of pixels and a pixel around it.
 struct Pyramid {
     eye: Point3<f64>,
+    /// Its four edges: z = 1 in the camera's frame, directions of the world.
+    edges: [Vector3<f64>; 4],
     /// Of its four sides, pointing outwards.
     normals: [Vector3<f64>; 4],
 }
@@ -197,8 +198,33 @@ impl Pyramid {
             .map(|(u, v)| world_from_camera.rotation * camera.unproject(u, v, 1.0).coords);
         Self {
             eye: Point3::from(world_from_camera.translation.vector),
+            edges: corners,
             normals: std::array::from_fn(|side| corners[(side + 1) % 4].cross(&corners[side])),
         }
+    }
+
+    /// No ray of the pyramid meets the shape nearer than this, metres along the ray.
+    fn nearest_m(&self, shape: &Shape) -> f64 {
+        let Shape::Solid(solid) = shape else {
+            return 0.0;
+        };
+        // A ray that enters the solid has passed every plane that faces the eye. Inverse depth of a plane is linear in
+        // the image, so it is greatest at an edge of the pyramid.
+        let inverse_depth = solid
+            .planes()
+            .iter()
+            .filter_map(|(normal, offset)| {
+                let distance = normal.dot(&self.eye.coords) - offset;
+                (distance > 0.0).then(|| {
+                    self.edges
+                        .iter()
+                        .map(|edge| -normal.dot(edge) / distance)
+                        .fold(0.0, f64::max)
+                })
+            })
+            .fold(f64::INFINITY, f64::min);
+        // Along the ray it is farther than in depth.
+        inverse_depth.recip()
     }
 
     /// Never wrong if it says no.
@@ -322,8 +348,12 @@ impl Tracer<'_> {
                     for left in (0..width).step_by(TILE) {
                         let right = (left + TILE).min(width);
                         let frame = Pyramid::over(camera, world_from_camera, left..right, top..top + height);
-                        let mut tile = Tile::over(&prints, left..right, top..top + height, |primitive| {
-                            frame.may_hold(&self.scene.bounds()[primitive])
+                        let mut tile = Tile::over(&prints, left..right, top..top + height, |print| {
+                            let primitive = print.primitive;
+                            frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
+                                let shape = &self.scene.primitives()[primitive].shape;
+                                frame.nearest_m(shape).max(print.nearest_m)
+                            })
                         });
                         let mut seen = Vec::with_capacity(TILE * TILE);
                         for row in 0..height {
@@ -402,12 +432,11 @@ impl Tracer<'_> {
         rendering
     }
 
-    /// Where each primitive can be seen in the image at all, nearest first.
+    /// Where each primitive can be seen in the image at all.
     fn footprints(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Vec<Footprint> {
         let camera_from_world = world_from_camera.inverse();
         let eye = Point3::from(world_from_camera.translation.vector);
-        let mut prints: Vec<_> = self
-            .scene
+        self.scene
             .bounds()
             .iter()
             .enumerate()
@@ -417,9 +446,7 @@ impl Tracer<'_> {
                 nearest_m: (eye.sup(&bounds.min).inf(&bounds.max) - eye).norm(),
             })
             .filter(|print| print.window.iter().all(|range| !range.is_empty()))
-            .collect();
-        prints.sort_by(|a, b| a.nearest_m.total_cmp(&b.nearest_m));
-        prints
+            .collect()
     }
 
     /// The nearest hit of a ray through the tile.
@@ -858,8 +885,9 @@ fn rough(
         let contrast = (0..3)
             .map(|i| (a[i] - b[i]).abs() / a[i].max(b[i]).max(0.05))
             .fold(0.0, f32::max);
-        let same_face = lit[here].face == lit[there].face;
-        object[here] != object[there] || contrast > if same_face { CONTRAST } else { EDGE_CONTRAST }
+        // Textures are averaged over the pixel already; what is seen through glass is not.
+        let needless = lit[here].face == lit[there].face && lit[here].face != UNLIT.face;
+        object[here] != object[there] || (!needless && contrast > CONTRAST)
     };
     (column > 0 && differs(here - 1))
         || (column + 1 < width && differs(here + 1))
