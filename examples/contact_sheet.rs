@@ -15,7 +15,9 @@ fn main() -> anyhow::Result<()> {
     let (script, telling): (_, &[u64]) = match name.as_str() {
         "tabletop" => (
             Script::tabletop(1),
-            &[1, 85, 170, 332, 339, 345, 465, 662, 674, 680, 800, 970, 979, 981, 983, 1010],
+            &[
+                1, 85, 170, 332, 339, 345, 465, 662, 674, 680, 800, 970, 979, 981, 983, 1010,
+            ],
         ),
         "objects" => (
             Script::objects(1),
@@ -29,7 +31,11 @@ fn main() -> anyhow::Result<()> {
     };
     let chosen = arguments
         .next()
-        .map(|list| list.split(',').map(str::parse).collect::<Result<Vec<u64>, _>>())
+        .map(|list| {
+            list.split(',')
+                .map(str::parse)
+                .collect::<Result<Vec<u64>, _>>()
+        })
         .transpose()
         .context("frames are numbers with commas between")?;
     let robot: usize = arguments
@@ -48,7 +54,10 @@ fn main() -> anyhow::Result<()> {
         let image = &capture.middle.image;
         let image = RgbImage::from_raw(image.width as u32, image.height as u32, image.data.clone())
             .context("three bytes a pixel")?;
-        let (x, y) = ((index % columns) as u32 * width, (index / columns) as u32 * height);
+        let (x, y) = (
+            (index % columns) as u32 * width,
+            (index / columns) as u32 * height,
+        );
         imageops::replace(&mut sheet, &image, i64::from(x), i64::from(y));
         println!(
             "frame {frame}: phase {} {}, present: {}",
@@ -57,6 +66,8 @@ fn main() -> anyhow::Result<()> {
             script.present(&capture.moment)
         );
     }
-    sheet.save(&path).with_context(|| format!("cannot write {path}"))?;
+    sheet
+        .save(&path)
+        .with_context(|| format!("cannot write {path}"))?;
     Ok(())
 }

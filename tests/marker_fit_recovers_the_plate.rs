@@ -50,7 +50,10 @@ fn exact_markers_give_the_exact_pose() {
         let pose = random_pose(&mut stream);
         let fit = fit_plate(&plate(), &seen(&plate(), &pose), TOLERANCE_M).unwrap();
         let (metres, radians) = apart(&fit.world_from_plate, &pose);
-        assert!(metres < 1e-12 && radians < 1e-7, "{metres} m, {radians} rad");
+        assert!(
+            metres < 1e-12 && radians < 1e-7,
+            "{metres} m, {radians} rad"
+        );
         assert!(fit.residual_m < 1e-12);
         assert_eq!(fit.recovered, None);
     }
@@ -147,7 +150,11 @@ fn one_marker_five_centimetres_off_is_found() {
             .iter()
             .enumerate()
             .map(|(index, marker)| {
-                let off = if index == wrong { away } else { Vector3::zeros() };
+                let off = if index == wrong {
+                    away
+                } else {
+                    Vector3::zeros()
+                };
                 Some(pose * marker + normal3(&mut stream, 0.3e-3) + off)
             })
             .collect();
@@ -166,7 +173,9 @@ fn one_marker_five_centimetres_off_is_found() {
 
 #[test]
 fn markers_on_a_line_are_refused() {
-    let line: Vec<_> = (0..4).map(|i| Point3::new(0.07 * f64::from(i), 0.001, 0.0)).collect();
+    let line: Vec<_> = (0..4)
+        .map(|i| Point3::new(0.07 * f64::from(i), 0.001, 0.0))
+        .collect();
     let pose = random_pose(&mut Stream::new(5, &[]));
     assert_eq!(
         fit_plate(&line, &seen(&line, &pose), TOLERANCE_M),
@@ -202,12 +211,24 @@ fn nonsense_is_an_error_and_no_panic() {
     let pose = random_pose(&mut Stream::new(7, &[]));
     let mut markers = seen(&plate(), &pose);
     markers[1] = Some(Point3::new(f64::NAN, 0.0, 0.0));
-    assert_eq!(fit_plate(&plate(), &markers, TOLERANCE_M), Err(LocaliseError::NotFinite));
+    assert_eq!(
+        fit_plate(&plate(), &markers, TOLERANCE_M),
+        Err(LocaliseError::NotFinite)
+    );
     assert_eq!(
         fit_plate(&plate(), &markers[..3], TOLERANCE_M),
-        Err(LocaliseError::Count { expected: 4, got: 3 })
+        Err(LocaliseError::Count {
+            expected: 4,
+            got: 3
+        })
     );
-    assert_eq!(fit_plate(&[], &[], TOLERANCE_M), Err(LocaliseError::TooFew { visible: 0 }));
+    assert_eq!(
+        fit_plate(&[], &[], TOLERANCE_M),
+        Err(LocaliseError::TooFew { visible: 0 })
+    );
     let same = vec![Some(Point3::origin()); 4];
-    assert_eq!(fit_plate(&plate(), &same, TOLERANCE_M), Err(LocaliseError::Collinear));
+    assert_eq!(
+        fit_plate(&plate(), &same, TOLERANCE_M),
+        Err(LocaliseError::Collinear)
+    );
 }

@@ -67,7 +67,12 @@ fn agrees(rendering: &Rendering, pose: &Pose, expected: impl Fn(&Ray) -> Option<
 fn a_plane_has_its_depth() {
     let pose = looking(Point3::new(0.3, -1.4, 1.1), Point3::new(0.0, 0.0, 0.4));
     let mut builder = Builder::new(THING);
-    builder.cuboid(Point3::new(0.0, 0.0, -0.5), [200.0, 200.0, 0.5], 0.3, grey());
+    builder.cuboid(
+        Point3::new(0.0, 0.0, -0.5),
+        [200.0, 200.0, 0.5],
+        0.3,
+        grey(),
+    );
     let rendering = render(builder, &pose);
     agrees(&rendering, &pose, |ray| {
         let t = -ray.origin.z / ray.direction.z;
@@ -99,7 +104,9 @@ fn an_upright_cylinder_has_its_depth() {
     let mut builder = Builder::new(THING);
     builder.add(
         Shape::Frustum(
-            Frustum::new(foot, foot + Vector3::z() * height, radius, radius).with_base().with_top(),
+            Frustum::new(foot, foot + Vector3::z() * height, radius, radius)
+                .with_base()
+                .with_top(),
         ),
         grey(),
     );
@@ -128,9 +135,15 @@ fn light_bends_as_snell_says() {
             let direction = Vector3::new(angle.sin(), 0.0, -angle.cos());
             let inside = refracted(&direction, &Vector3::z(), 1.0 / index).unwrap();
             assert!((inside.norm() - 1.0).abs() < 1e-12);
-            assert!((inside.x - angle.sin() / index).abs() < 1e-12, "sin a = n sin b");
+            assert!(
+                (inside.x - angle.sin() / index).abs() < 1e-12,
+                "sin a = n sin b"
+            );
             let outside = refracted(&inside, &Vector3::z(), index).unwrap();
-            assert!((outside - direction).norm() < 1e-9, "the way back is the way there");
+            assert!(
+                (outside - direction).norm() < 1e-9,
+                "the way back is the way there"
+            );
         }
         let critical = (1.0 / index).asin();
         for (off, bends) in [(-1e-6, true), (1e-6, false)] {
@@ -162,14 +175,29 @@ fn a_pane_of_glass_shifts_what_is_behind_it() {
         let mut builder = Builder::new(THING);
         let dark = matte(Pattern::Plain([0.02; 3]));
         let bright = matte(Pattern::Plain(rgb(0xffffff)));
-        builder.cuboid(Point3::new(bent - 5.0, wall_y + 0.05, -5.0), [10.0, 0.1, 10.0], 0.0, dark);
-        builder.cuboid(Point3::new(bent + 5.0, wall_y + 0.05, -5.0), [10.0, 0.1, 10.0], 0.0, bright);
+        builder.cuboid(
+            Point3::new(bent - 5.0, wall_y + 0.05, -5.0),
+            [10.0, 0.1, 10.0],
+            0.0,
+            dark,
+        );
+        builder.cuboid(
+            Point3::new(bent + 5.0, wall_y + 0.05, -5.0),
+            [10.0, 0.1, 10.0],
+            0.0,
+            bright,
+        );
         if pane {
             let glass = Material {
                 pattern: Pattern::Plain([1.0; 3]),
                 finish: Finish::Glass { index },
             };
-            builder.cuboid(Point3::new(0.0, -0.2, -2.0), [8.0, thickness, 4.0], 0.0, glass);
+            builder.cuboid(
+                Point3::new(0.0, -0.2, -2.0),
+                [8.0, thickness, 4.0],
+                0.0,
+                glass,
+            );
         }
         render(builder, &pose)
     };
@@ -183,10 +211,16 @@ fn a_pane_of_glass_shifts_what_is_behind_it() {
             .expect("an edge")
     };
     let seen = edge(&picture(true));
-    assert!(seen.abs_diff(column) <= 1, "the edge is seen at {seen}, not {column}");
+    assert!(
+        seen.abs_diff(column) <= 1,
+        "the edge is seen at {seen}, not {column}"
+    );
     // Without the pane the same edge is far from there.
     let direct = camera.fx * bent / (wall_y - eye.y) + camera.cx;
-    assert!((direct - column as f64).abs() > 3.0, "the pane matters: {direct}");
+    assert!(
+        (direct - column as f64).abs() > 3.0,
+        "the pane matters: {direct}"
+    );
 }
 
 #[test]
@@ -214,7 +248,10 @@ fn left_middle_and_right_see_one_world() {
     let rig = &script.stations[0].rig;
     let camera = &rig.intrinsics;
     let (left, right) = capture.sides.as_ref().unwrap();
-    for (side, middle_from_side) in [(left, &rig.middle_from_left), (right, &rig.middle_from_right)] {
+    for (side, middle_from_side) in [
+        (left, &rig.middle_from_left),
+        (right, &rig.middle_from_right),
+    ] {
         let (mut same, mut hidden, mut through) = (0, 0, 0);
         for row in 0..camera.height {
             for column in 0..camera.width {
@@ -229,7 +266,9 @@ fn left_middle_and_right_see_one_world() {
                     continue;
                 }
                 let (ray, cos) = camera_ray(camera, &capture.world_from_camera, u, v);
-                let hit = scene.nearest(&ray, 1e-7, f64::INFINITY, |_| true).expect("a closed room");
+                let hit = scene
+                    .nearest(&ray, 1e-7, f64::INFINITY, |_| true)
+                    .expect("a closed room");
                 let seen = hit.crossing.t * cos;
                 if (seen - in_middle.z).abs() < 1e-5 {
                     same += 1;
@@ -245,7 +284,10 @@ fn left_middle_and_right_see_one_world() {
         assert!(same > 60_000);
         assert!(hidden < same / 20);
         // Depth is single precision: a ray may just miss a rim.
-        assert!(through < same / 10_000, "{through} rays went through what the side camera sees");
+        assert!(
+            through < same / 10_000,
+            "{through} rays went through what the side camera sees"
+        );
     }
 }
 
@@ -290,9 +332,22 @@ fn a_mask_is_the_same_before_and_while_the_thing_stands() {
 #[test]
 fn the_person_is_seen_while_events_last() {
     let script = Script::tabletop(1);
-    for (frame, there) in [(320, false), (345, true), (400, false), (662, true), (675, true), (970, true), (1000, false)] {
+    for (frame, there) in [
+        (320, false),
+        (345, true),
+        (400, false),
+        (662, true),
+        (675, true),
+        (970, true),
+        (1000, false),
+    ] {
         let capture = script.capture(0, frame - 1, Views::Middle);
-        let pixels = capture.middle.object.iter().filter(|&&object| object == PERSON).count();
+        let pixels = capture
+            .middle
+            .object
+            .iter()
+            .filter(|&&object| object == PERSON)
+            .count();
         assert_eq!(pixels > 200, there, "frame {frame}: {pixels} pixels");
     }
 }

@@ -8,7 +8,11 @@ use surprised::simulation::{
 };
 
 fn lines(dir: &Path, name: &str) -> Vec<String> {
-    fs::read_to_string(dir.join(name)).unwrap().lines().map(String::from).collect()
+    fs::read_to_string(dir.join(name))
+        .unwrap()
+        .lines()
+        .map(String::from)
+        .collect()
 }
 
 fn some(truth: Truth) -> Options {
@@ -28,12 +32,21 @@ fn every_list_names_every_frame_and_every_file_is_there() {
     let script = Script::tabletop(1);
     let summary = recording(dir, &script, &some(Truth::Exact)).unwrap();
     assert_eq!((summary.frames, summary.without_pose), (4, 0));
-    assert_eq!(lines(dir, "calibration.txt"), ["# fx fy cx cy", "262.5 262.5 159.5 119.5"]);
+    assert_eq!(
+        lines(dir, "calibration.txt"),
+        ["# fx fy cx cy", "262.5 262.5 159.5 119.5"]
+    );
     assert_eq!(lines(dir, "rgb.txt")[0], "# timestamp filename");
-    assert_eq!(lines(dir, "groundtruth.txt")[0], "# timestamp tx ty tz qx qy qz qw");
+    assert_eq!(
+        lines(dir, "groundtruth.txt")[0],
+        "# timestamp tx ty tz qx qy qz qw"
+    );
     // Frame 670 (from 0) is taken 670 / 7 s after the start.
     assert_eq!(lines(dir, "rgb.txt")[1], "1095.714286 rgb/1095.714286.jpg");
-    assert_eq!(lines(dir, "depth.txt")[1], "1095.714286 depth/1095.714286.png");
+    assert_eq!(
+        lines(dir, "depth.txt")[1],
+        "1095.714286 depth/1095.714286.png"
+    );
     let phases = lines(dir, "phases.csv");
     assert_eq!(phases[0], "# timestamp,phase,pass,present,evaluated");
     assert_eq!(phases[1], "1095.714286,B,back,glass+person,glass");
@@ -60,11 +73,17 @@ fn every_list_names_every_frame_and_every_file_is_there() {
     let depth = depth.as_luma16().expect("16 bit");
     for (pixel, &metres) in depth.pixels().zip(&capture.middle.depth_m) {
         let written = f32::from(pixel.0[0]) / 5000.0;
-        assert!((written - metres).abs() <= 1.01e-4, "{written} instead of {metres}");
+        assert!(
+            (written - metres).abs() <= 1.01e-4,
+            "{written} instead of {metres}"
+        );
     }
     for (item, name) in ["glass", "cup"].into_iter().enumerate() {
         let mask = image::open(dir.join(format!("mask/{name}/1096.571429.png"))).unwrap();
-        assert_eq!(mask.as_luma8().expect("8 bit").as_raw(), &capture.middle.masks[item]);
+        assert_eq!(
+            mask.as_luma8().expect("8 bit").as_raw(),
+            &capture.middle.masks[item]
+        );
     }
 }
 
@@ -80,7 +99,10 @@ fn measured_poses_are_near_the_truth_and_measured_depth_sees_through_glass() {
         let numbers: Vec<f64> = line.split(' ').map(|n| n.parse().unwrap()).collect();
         let frame = (numbers[0] - 1000.0) * 7.0;
         let truth = script.world_from_camera(0, frame).translation.vector;
-        let off = (0..3).map(|i| (numbers[1 + i] - truth[i]).powi(2)).sum::<f64>().sqrt();
+        let off = (0..3)
+            .map(|i| (numbers[1 + i] - truth[i]).powi(2))
+            .sum::<f64>()
+            .sqrt();
         assert!(off > 0.0 && off < 3e-3, "{off} m");
     }
     let capture = script.capture(0, 670, Views::Middle);
@@ -103,11 +125,17 @@ fn what_cannot_be_written_is_an_error() {
     options.station = 1;
     assert!(matches!(
         recording(dir.path(), &script, &options),
-        Err(WriteError::NoStation { station: 1, stations: 1 })
+        Err(WriteError::NoStation {
+            station: 1,
+            stations: 1
+        })
     ));
     options.station = 0;
     options.step = 0;
-    assert!(matches!(recording(dir.path(), &script, &options), Err(WriteError::Step)));
+    assert!(matches!(
+        recording(dir.path(), &script, &options),
+        Err(WriteError::Step)
+    ));
     let file = dir.path().join("file");
     fs::write(&file, "").unwrap();
     let error = recording(&file, &script, &some(Truth::Exact)).unwrap_err();

@@ -11,7 +11,11 @@ use surprised::{
 
 fn names(script: &Script, frame: u64) -> Vec<&'static str> {
     let moment = script.story.moment(frame as f64);
-    moment.standing.iter().map(|&item| script.story.items[item].name).collect()
+    moment
+        .standing
+        .iter()
+        .map(|&item| script.story.items[item].name)
+        .collect()
 }
 
 #[test]
@@ -28,14 +32,19 @@ fn tabletop_is_table_one() {
             let moment = script.story.moment(frame as f64);
             assert_eq!(moment.phase, phase, "frame {frame}");
             assert_eq!(names(&script, frame), standing, "frame {frame}");
-            assert_eq!(moment.evaluated.map(|item| script.story.items[item].name), evaluated);
+            assert_eq!(
+                moment.evaluated.map(|item| script.story.items[item].name),
+                evaluated
+            );
         }
     }
     let events = [(325, 358), (657, 686), (962, 985)];
     for frame in 1..=1283 {
         let there = script.story.moment(frame as f64).person.is_some();
         // At the last frame of an event the person has just gone.
-        let expected = events.iter().any(|&(first, last)| (first..last).contains(&frame));
+        let expected = events
+            .iter()
+            .any(|&(first, last)| (first..last).contains(&frame));
         assert_eq!(there, expected, "frame {frame}");
     }
 }
@@ -44,14 +53,25 @@ fn tabletop_is_table_one() {
 fn every_phase_goes_from_q1_to_q2_and_back_without_a_jump() {
     let script = Script::tabletop(1);
     let angle = |frame: u64| {
-        let position = script.world_from_camera(0, frame as f64 - 1.0).translation.vector;
+        let position = script
+            .world_from_camera(0, frame as f64 - 1.0)
+            .translation
+            .vector;
         position.x.atan2(-position.y).to_degrees()
     };
     for frame in [1, 345, 680, 985, 1283] {
-        assert!((angle(frame) - 35.0).abs() < 2.0, "Q1 at {frame}: {}", angle(frame));
+        assert!(
+            (angle(frame) - 35.0).abs() < 2.0,
+            "Q1 at {frame}: {}",
+            angle(frame)
+        );
     }
     for frame in [171, 520, 829, 1133] {
-        assert!((angle(frame) + 35.0).abs() < 2.0, "Q2 at {frame}: {}", angle(frame));
+        assert!(
+            (angle(frame) + 35.0).abs() < 2.0,
+            "Q2 at {frame}: {}",
+            angle(frame)
+        );
     }
     for frame in 1..1283u64 {
         let a = script.world_from_camera(0, frame as f64 - 1.0);
@@ -61,7 +81,10 @@ fn every_phase_goes_from_q1_to_q2_and_back_without_a_jump() {
         assert!(viewing_angle_rad(&a, &b) < 0.02);
     }
     // It stands at the turning points.
-    let (a, b) = (script.world_from_camera(0, 342.0), script.world_from_camera(0, 349.0));
+    let (a, b) = (
+        script.world_from_camera(0, 342.0),
+        script.world_from_camera(0, 349.0),
+    );
     assert!((a.translation.vector - b.translation.vector).norm() < 1e-9);
 }
 
@@ -73,17 +96,31 @@ fn no_pass_takes_the_path_of_another() {
             .map(|frame| script.world_from_camera(0, frame as f64).translation.vector)
             .collect()
     };
-    let passes = [driven(20..150), driven(190..320), driven(370..500), driven(540..660), driven(700..815)];
+    let passes = [
+        driven(20..150),
+        driven(190..320),
+        driven(370..500),
+        driven(540..660),
+        driven(700..815),
+    ];
     for (index, pass) in passes.iter().enumerate() {
         for other in &passes[..index] {
             let nearest: Vec<f64> = pass
                 .iter()
-                .map(|a| other.iter().map(|b| (a - b).norm()).fold(f64::INFINITY, f64::min))
+                .map(|a| {
+                    other
+                        .iter()
+                        .map(|b| (a - b).norm())
+                        .fold(f64::INFINITY, f64::min)
+                })
                 .collect();
             let mean = nearest.iter().sum::<f64>() / nearest.len() as f64;
             // Frames are 7 mm apart; a path taken twice would be nearer than half of that.
             assert!(mean > 0.004, "{mean} m");
-            assert!(nearest.iter().all(|&metres| metres < 0.08), "similar all the same");
+            assert!(
+                nearest.iter().all(|&metres| metres < 0.08),
+                "similar all the same"
+            );
         }
     }
 }
@@ -121,24 +158,37 @@ fn a_patrol_is_quiet_first_and_then_full_of_events_that_follow_each_other() {
                 changes += 1;
                 assert_eq!(before.len().abs_diff(after.len()), 1, "one thing at a time");
                 let moment = script.story.moment((frame + 1) as f64);
-                assert!(moment.person.is_some(), "things do not move by themselves: frame {frame}");
+                assert!(
+                    moment.person.is_some(),
+                    "things do not move by themselves: frame {frame}"
+                );
             }
         }
         assert!(changes > 35, "seed {seed}: {changes} changes");
         assert!(seen.len() >= 4, "seed {seed}: {seen:?}");
     }
     let far = 400_000_000;
-    assert_eq!(names(&Script::patrol(1), far), names(&Script::patrol(1), far));
+    assert_eq!(
+        names(&Script::patrol(1), far),
+        names(&Script::patrol(1), far)
+    );
     assert_ne!(
-        (1..3000).map(|frame| names(&Script::patrol(1), frame)).collect::<Vec<_>>(),
-        (1..3000).map(|frame| names(&Script::patrol(2), frame)).collect::<Vec<_>>()
+        (1..3000)
+            .map(|frame| names(&Script::patrol(1), frame))
+            .collect::<Vec<_>>(),
+        (1..3000)
+            .map(|frame| names(&Script::patrol(2), frame))
+            .collect::<Vec<_>>()
     );
 }
 
 #[test]
 fn a_frame_is_the_same_whenever_and_by_however_many_threads_it_is_made() {
     let once = Script::tabletop(5).capture(0, 676, Views::Triple);
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(1)
+        .build()
+        .unwrap();
     let script = Script::tabletop(5);
     let again = pool.install(|| {
         script.capture(0, 3, Views::Middle);
@@ -148,7 +198,13 @@ fn a_frame_is_the_same_whenever_and_by_however_many_threads_it_is_made() {
     assert_eq!(once.sides, again.sides);
     assert_eq!(once.depth_m, again.depth_m);
     assert_eq!(once.markers, again.markers);
-    assert_ne!(once.middle.image, Script::tabletop(6).capture(0, 676, Views::Middle).middle.image);
+    assert_ne!(
+        once.middle.image,
+        Script::tabletop(6)
+            .capture(0, 676, Views::Middle)
+            .middle
+            .image
+    );
 }
 
 #[test]
@@ -169,8 +225,11 @@ fn two_robots_and_two_heads_look_from_different_places() {
     while let Some(place) = places.pop() {
         assert!(places.iter().all(|other| (place - other).norm() > 0.1));
     }
-    let ids: std::collections::BTreeSet<_> =
-        script.stations.iter().map(|at| (at.robot.clone(), at.camera.clone())).collect();
+    let ids: std::collections::BTreeSet<_> = script
+        .stations
+        .iter()
+        .map(|at| (at.robot.clone(), at.camera.clone()))
+        .collect();
     assert_eq!(ids.len(), 4);
 }
 
@@ -197,8 +256,14 @@ fn the_tracker_gives_the_pose_to_less_than_a_millimetre() {
     let median = metres[metres.len() / 2];
     println!("median {median} m, {recovered} recovered, {refused} refused of 4000");
     assert!(median < 1e-3);
-    assert!((100..1000).contains(&recovered), "single LEDs are lost now and then: {recovered}");
-    assert!((1..80).contains(&refused), "and sometimes too many: {refused}");
+    assert!(
+        (100..1000).contains(&recovered),
+        "single LEDs are lost now and then: {recovered}"
+    );
+    assert!(
+        (1..80).contains(&refused),
+        "and sometimes too many: {refused}"
+    );
 }
 
 fn mean_and_sd(values: impl Iterator<Item = f64> + Clone) -> (f64, f64) {
@@ -220,7 +285,11 @@ fn noise_is_unbiased_and_grows_with_light_and_exposure_drifts_when_told_to() {
             let grey = vec![[0.02f32 + 0.1 * seed as f32; 3]; 4000];
             let quiet = Sensor::NOISELESS.expose(&grey, 100, 1.0, 1, &[]);
             let loud = Sensor::default().expose(&grey, 100, 1.0, 1, &[]);
-            let errors = loud.data.iter().zip(&quiet.data).map(|(&a, &b)| f64::from(a) - f64::from(b));
+            let errors = loud
+                .data
+                .iter()
+                .zip(&quiet.data)
+                .map(|(&a, &b)| f64::from(a) - f64::from(b));
             mean_and_sd(errors.collect::<Vec<_>>().into_iter())
         })
         .collect();
@@ -241,11 +310,13 @@ fn noise_is_unbiased_and_grows_with_light_and_exposure_drifts_when_told_to() {
     assert!((0.8..5.0).contains(&sd), "noise of {sd} grey levels");
 
     clean.sensor.exposure_drift = 0.2;
-    let level = |capture: &Capture| mean_and_sd(capture.middle.image.data.iter().map(|&v| f64::from(v))).0;
+    let level =
+        |capture: &Capture| mean_and_sd(capture.middle.image.data.iter().map(|&v| f64::from(v))).0;
     let levels: Vec<f64> = [0, 25, 50, 75]
         .map(|frame| level(&clean.capture(0, frame, Views::Middle)))
         .to_vec();
-    let spread = levels.iter().fold(0.0f64, |a, &b| a.max(b)) - levels.iter().fold(255.0f64, |a, &b| a.min(b));
+    let spread = levels.iter().fold(0.0f64, |a, &b| a.max(b))
+        - levels.iter().fold(255.0f64, |a, &b| a.min(b));
     assert!(spread > 4.0, "{levels:?}");
 }
 
@@ -260,7 +331,10 @@ fn an_open_shutter_blurs_what_moves() {
         image
             .data
             .chunks_exact(3 * image.width)
-            .flat_map(|row| row.windows(4).map(|pair| u64::from(pair[0].abs_diff(pair[3])).pow(2)))
+            .flat_map(|row| {
+                row.windows(4)
+                    .map(|pair| u64::from(pair[0].abs_diff(pair[3])).pow(2))
+            })
             .sum()
     };
     assert!(detail(&blurred) < detail(&sharp) * 95 / 100);

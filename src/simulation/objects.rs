@@ -96,8 +96,17 @@ impl Builder {
         self
     }
 
-    pub fn cuboid(&mut self, origin: Point3<f64>, size: [f64; 3], yaw_rad: f64, material: Material) -> &mut Self {
-        self.add(Shape::Solid(Solid::cuboid(origin, size.into(), yaw_rad)), material)
+    pub fn cuboid(
+        &mut self,
+        origin: Point3<f64>,
+        size: [f64; 3],
+        yaw_rad: f64,
+        material: Material,
+    ) -> &mut Self {
+        self.add(
+            Shape::Solid(Solid::cuboid(origin, size.into(), yaw_rad)),
+            material,
+        )
     }
 
     pub fn sphere(&mut self, center: Point3<f64>, radius: f64, material: Material) -> &mut Self {
@@ -133,7 +142,13 @@ impl Builder {
     }
 
     /// An open vessel with a wall of the given thickness.
-    fn vessel(&mut self, foot: Point3<f64>, vessel: &Vessel, outside: &Material, inside: &Material) -> &mut Self {
+    fn vessel(
+        &mut self,
+        foot: Point3<f64>,
+        vessel: &Vessel,
+        outside: &Material,
+        inside: &Material,
+    ) -> &mut Self {
         let Vessel {
             height,
             base_radius,
@@ -170,7 +185,15 @@ impl Builder {
     }
 
     /// A half ring beside a vessel, in the vertical plane of `placement`'s right.
-    fn handle(&mut self, placement: &Placement, reach: (f64, f64), middle: f64, half_height: f64, radius: f64, material: &Material) -> &mut Self {
+    fn handle(
+        &mut self,
+        placement: &Placement,
+        reach: (f64, f64),
+        middle: f64,
+        half_height: f64,
+        radius: f64,
+        material: &Material,
+    ) -> &mut Self {
         let points: Vec<_> = (0..=8)
             .map(|step| {
                 let angle = std::f64::consts::PI * (f64::from(step) / 8.0 - 0.5);
@@ -277,7 +300,14 @@ impl Kind {
                     floor: 0.006,
                 };
                 builder.vessel(foot, &mug, &stripes, &glazed(rgb(0xf1ebdc)));
-                builder.handle(placement, (0.038, 0.028), 0.050, 0.030, 0.006, &glazed(rgb(0xe9b23a)));
+                builder.handle(
+                    placement,
+                    (0.038, 0.028),
+                    0.050,
+                    0.030,
+                    0.006,
+                    &glazed(rgb(0xe9b23a)),
+                );
             }
             Self::MilkCarton => {
                 let paper = glossy(
@@ -296,14 +326,29 @@ impl Kind {
                     60.0,
                 );
                 builder.add(
-                    Shape::Solid(Solid::gabled(foot, Vector3::new(0.085, 0.085, 0.225), 0.038, yaw_rad)),
+                    Shape::Solid(Solid::gabled(
+                        foot,
+                        Vector3::new(0.085, 0.085, 0.225),
+                        0.038,
+                        yaw_rad,
+                    )),
                     paper,
                 );
-                builder.cuboid(placement.at(0.0, 0.0, 0.222), [0.085, 0.005, 0.02], yaw_rad, plain(0xe9eef2));
+                builder.cuboid(
+                    placement.at(0.0, 0.0, 0.222),
+                    [0.085, 0.005, 0.02],
+                    yaw_rad,
+                    plain(0xe9eef2),
+                );
                 builder.add(
                     Shape::Frustum(
-                        Frustum::new(placement.at(0.0, -0.021, 0.205), placement.at(0.0, -0.030, 0.217), 0.013, 0.013)
-                            .with_top(),
+                        Frustum::new(
+                            placement.at(0.0, -0.021, 0.205),
+                            placement.at(0.0, -0.030, 0.217),
+                            0.013,
+                            0.013,
+                        )
+                        .with_top(),
                     ),
                     glossy(Pattern::Plain(rgb(0xc8372d)), 0.04, 120.0),
                 );
@@ -336,12 +381,16 @@ impl Kind {
                 let tin = metal(0xb9bcc0);
                 builder.add(
                     Shape::Frustum(
-                        Frustum::new(foot + up * 0.15, foot + up * 0.156, 0.0515, 0.0515).with_base().with_top(),
+                        Frustum::new(foot + up * 0.15, foot + up * 0.156, 0.0515, 0.0515)
+                            .with_base()
+                            .with_top(),
                     ),
                     tin.clone(),
                 );
                 builder.add(
-                    Shape::Frustum(Frustum::new(foot, foot + up * 0.005, 0.0515, 0.0515).with_top()),
+                    Shape::Frustum(
+                        Frustum::new(foot, foot + up * 0.005, 0.0515, 0.0515).with_top(),
+                    ),
                     tin,
                 );
             }
@@ -389,7 +438,12 @@ impl Kind {
                     let yaw = yaw_rad + turn;
                     let base = |up: f64| placement.at(0.0, 0.0, level + up);
                     builder.cuboid(base(0.0), [width, depth, 0.004], yaw, cover.clone());
-                    builder.cuboid(base(0.004), [width - 0.01, depth - 0.006, height - 0.008], yaw, pages);
+                    builder.cuboid(
+                        base(0.004),
+                        [width - 0.01, depth - 0.006, height - 0.008],
+                        yaw,
+                        pages,
+                    );
                     builder.cuboid(base(height - 0.004), [width, depth, 0.004], yaw, cover);
                     level += height;
                 }
@@ -413,9 +467,25 @@ impl Kind {
                     250.0,
                 );
                 builder.vessel(foot, &bowl, &blue, &glazed(rgb(0xe9e6da)));
-                apple(&mut builder, placement.at(-0.045, 0.035, 0.028), 0.038, 0xa9c13f, 0xc8432c);
-                apple(&mut builder, placement.at(0.045, 0.045, 0.028), 0.037, 0xb5302a, 0xd9a23a);
-                for (right, forward, up) in [(-0.035, -0.045, 0.058), (0.050, -0.035, 0.058), (0.005, 0.005, 0.098)] {
+                apple(
+                    &mut builder,
+                    placement.at(-0.045, 0.035, 0.028),
+                    0.038,
+                    0xa9c13f,
+                    0xc8432c,
+                );
+                apple(
+                    &mut builder,
+                    placement.at(0.045, 0.045, 0.028),
+                    0.037,
+                    0xb5302a,
+                    0xd9a23a,
+                );
+                for (right, forward, up) in [
+                    (-0.035, -0.045, 0.058),
+                    (0.050, -0.035, 0.058),
+                    (0.005, 0.005, 0.098),
+                ] {
                     builder.sphere(placement.at(right, forward, up), 0.037, orange());
                 }
             }
@@ -423,8 +493,23 @@ impl Kind {
             Self::Breakfast => {
                 let plate = glazed(rgb(0xeceadf));
                 let up = Vector3::z();
-                builder.add(Shape::Frustum(Frustum::new(foot, foot + up * 0.006, 0.06, 0.075).with_base().with_top()), plate.clone());
-                builder.add(Shape::Frustum(Frustum::new(foot + up * 0.006, foot + up * 0.016, 0.075, 0.105)), plate);
+                builder.add(
+                    Shape::Frustum(
+                        Frustum::new(foot, foot + up * 0.006, 0.06, 0.075)
+                            .with_base()
+                            .with_top(),
+                    ),
+                    plate.clone(),
+                );
+                builder.add(
+                    Shape::Frustum(Frustum::new(
+                        foot + up * 0.006,
+                        foot + up * 0.016,
+                        0.075,
+                        0.105,
+                    )),
+                    plate,
+                );
                 let crust = matte(Pattern::Mottled {
                     a: rgb(0xb9793a),
                     b: rgb(0x7a4217),
@@ -434,24 +519,51 @@ impl Kind {
                 let points: Vec<_> = (0..7)
                     .map(|step| {
                         let angle = -0.4 + f64::from(step) * 0.62;
-                        let thick = 0.011 + 0.013 * (f64::from(step) / 6.0 * std::f64::consts::PI).sin();
-                        (placement.at(0.047 * angle.cos(), 0.047 * angle.sin(), 0.008 + thick), thick)
+                        let thick =
+                            0.011 + 0.013 * (f64::from(step) / 6.0 * std::f64::consts::PI).sin();
+                        (
+                            placement.at(0.047 * angle.cos(), 0.047 * angle.sin(), 0.008 + thick),
+                            thick,
+                        )
                     })
                     .collect();
                 builder.tube(&points, &crust);
-                builder.cuboid(placement.at(0.135, 0.0, 0.0), [0.016, 0.10, 0.003], yaw_rad, metal(0xc9cbd0));
-                builder.cuboid(placement.at(0.135, -0.095, 0.0), [0.018, 0.09, 0.010], yaw_rad, plain(0x3b2a20));
+                builder.cuboid(
+                    placement.at(0.135, 0.0, 0.0),
+                    [0.016, 0.10, 0.003],
+                    yaw_rad,
+                    metal(0xc9cbd0),
+                );
+                builder.cuboid(
+                    placement.at(0.135, -0.095, 0.0),
+                    [0.018, 0.09, 0.010],
+                    yaw_rad,
+                    plain(0x3b2a20),
+                );
             }
             Self::Candle => {
                 let up = Vector3::z();
                 let brass = glossy(Pattern::Plain(rgb(0xb98b3c)), 0.35, 120.0);
-                builder.add(Shape::Frustum(Frustum::new(foot, foot + up * 0.012, 0.045, 0.030).with_top()), brass.clone());
-                builder.add(Shape::Frustum(Frustum::new(foot + up * 0.012, foot + up * 0.05, 0.014, 0.018).with_top()), brass);
                 builder.add(
-                    Shape::Frustum(Frustum::new(foot + up * 0.05, foot + up * 0.19, 0.012, 0.011).with_top()),
+                    Shape::Frustum(Frustum::new(foot, foot + up * 0.012, 0.045, 0.030).with_top()),
+                    brass.clone(),
+                );
+                builder.add(
+                    Shape::Frustum(
+                        Frustum::new(foot + up * 0.012, foot + up * 0.05, 0.014, 0.018).with_top(),
+                    ),
+                    brass,
+                );
+                builder.add(
+                    Shape::Frustum(
+                        Frustum::new(foot + up * 0.05, foot + up * 0.19, 0.012, 0.011).with_top(),
+                    ),
                     glossy(Pattern::Plain(rgb(0xf2e9cf)), 0.03, 60.0),
                 );
-                builder.tube(&[(foot + up * 0.19, 0.0015), (foot + up * 0.2, 0.0012)], &plain(0x222222));
+                builder.tube(
+                    &[(foot + up * 0.19, 0.0015), (foot + up * 0.2, 0.0012)],
+                    &plain(0x222222),
+                );
             }
         }
         builder.primitives
@@ -483,10 +595,18 @@ fn apple(builder: &mut Builder, foot: Point3<f64>, radius: f64, skin: u32, blush
         120.0,
     );
     let center = foot + Vector3::z() * radius * 0.92;
-    builder.ellipsoid(center, [radius, radius, radius * 0.92], Rotation3::identity(), skin);
+    builder.ellipsoid(
+        center,
+        [radius, radius, radius * 0.92],
+        Rotation3::identity(),
+        skin,
+    );
     let top = center + Vector3::z() * radius * 0.85;
     builder.tube(
-        &[(top, 0.002), (top + Vector3::new(0.004, 0.0, 0.014), 0.0015)],
+        &[
+            (top, 0.002),
+            (top + Vector3::new(0.004, 0.0, 0.014), 0.0015),
+        ],
         &plain(0x4a331d),
     );
 }
@@ -502,8 +622,18 @@ fn teapot(builder: &mut Builder, placement: &Placement) {
         0.06,
         350.0,
     );
-    builder.ellipsoid(placement.at(0.0, 0.0, 0.066), [0.085, 0.085, 0.066], Rotation3::identity(), glaze.clone());
-    builder.ellipsoid(placement.at(0.0, 0.0, 0.122), [0.046, 0.046, 0.020], Rotation3::identity(), glaze.clone());
+    builder.ellipsoid(
+        placement.at(0.0, 0.0, 0.066),
+        [0.085, 0.085, 0.066],
+        Rotation3::identity(),
+        glaze.clone(),
+    );
+    builder.ellipsoid(
+        placement.at(0.0, 0.0, 0.122),
+        [0.046, 0.046, 0.020],
+        Rotation3::identity(),
+        glaze.clone(),
+    );
     builder.sphere(placement.at(0.0, 0.0, 0.150), 0.012, glaze.clone());
     builder.tube(
         &[
@@ -530,9 +660,16 @@ fn plant(builder: &mut Builder, placement: &Placement) {
     });
     let up = Vector3::z();
     let foot = placement.foot;
-    builder.add(Shape::Frustum(Frustum::new(foot, foot + up * 0.11, 0.050, 0.068).with_base()), clay.clone());
     builder.add(
-        Shape::Frustum(Frustum::new(foot + up * 0.10, foot + up * 0.125, 0.074, 0.076).with_base().with_top()),
+        Shape::Frustum(Frustum::new(foot, foot + up * 0.11, 0.050, 0.068).with_base()),
+        clay.clone(),
+    );
+    builder.add(
+        Shape::Frustum(
+            Frustum::new(foot + up * 0.10, foot + up * 0.125, 0.074, 0.076)
+                .with_base()
+                .with_top(),
+        ),
         clay,
     );
     builder.add(
@@ -563,6 +700,11 @@ fn plant(builder: &mut Builder, placement: &Placement) {
             0.03,
             40.0,
         );
-        builder.ellipsoid(root + rotation * Vector3::new(0.0, 0.0, length), [0.006, 0.024, length], rotation, green.clone());
+        builder.ellipsoid(
+            root + rotation * Vector3::new(0.0, 0.0, length),
+            [0.006, 0.024, length],
+            rotation,
+            green.clone(),
+        );
     }
 }

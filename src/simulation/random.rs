@@ -16,7 +16,8 @@ impl Stream {
     /// The stream for one purpose: equal keys give equal streams, different keys unrelated ones.
     pub fn new(seed: u64, key: &[u64]) -> Self {
         Self(Pcg64Mcg::seed_from_u64(
-            key.iter().fold(mix(seed), |state, &part| mix(state ^ mix(part))),
+            key.iter()
+                .fold(mix(seed), |state, &part| mix(state ^ mix(part))),
         ))
     }
 

@@ -21,7 +21,8 @@ pub struct Rig {
 impl Default for Rig {
     fn default() -> Self {
         let baseline = 0.06;
-        let beside = |x: f64| Pose::from_parts(Translation3::new(x, 0.0, 0.0), UnitQuaternion::identity());
+        let beside =
+            |x: f64| Pose::from_parts(Translation3::new(x, 0.0, 0.0), UnitQuaternion::identity());
         let (width, depth) = (0.22, 0.16);
         Self {
             intrinsics: Intrinsics {
@@ -72,7 +73,11 @@ impl Arc {
     pub fn world_from_camera(&self, odometer: f64, seed: u64, robot: u64) -> Pose {
         let pass = odometer.floor();
         let share = odometer - pass;
-        let share = if pass.rem_euclid(2.0) == 0.0 { share } else { 1.0 - share };
+        let share = if pass.rem_euclid(2.0) == 0.0 {
+            share
+        } else {
+            1.0 - share
+        };
         let stray = |what: u64| {
             let key = robot * 16 + what;
             0.85 * wander(seed, key, odometer * 2.7) + 0.15 * wander(seed, key + 8, odometer * 17.0)

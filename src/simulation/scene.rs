@@ -17,9 +17,14 @@ impl ObjectId {
 pub enum Finish {
     Matte,
     /// Varnished, glazed or polished: mirrors `reflectance` at right angles (more at grazing ones).
-    Glossy { reflectance: f32, sharpness: f32 },
+    Glossy {
+        reflectance: f32,
+        sharpness: f32,
+    },
     /// Clear, with this index of refraction; normals point out of the material.
-    Glass { index: f64 },
+    Glass {
+        index: f64,
+    },
 }
 
 #[derive(Debug, Clone)]
@@ -109,7 +114,10 @@ impl Scene {
             build(&mut primitives, 0, &mut nodes);
         }
         Self {
-            bounds: primitives.iter().map(|primitive| primitive.shape.bounds()).collect(),
+            bounds: primitives
+                .iter()
+                .map(|primitive| primitive.shape.bounds())
+                .collect(),
             hides: primitives
                 .iter()
                 .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
@@ -211,25 +219,27 @@ impl Scene {
 
 /// Halves at the median along the longest side: at most 2 * log2(n) open branches.
 fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
-    let bounds = primitives
-        .iter()
-        .fold(Bounds::EMPTY, |bounds, primitive| bounds.joined(&primitive.shape.bounds()));
+    let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&primitive.shape.bounds())
+    });
     let index = nodes.len();
     nodes.push(Node {
         bounds,
         start: offset,
         count: primitives.len() as u32,
-        hides_lamp: primitives.iter().any(|primitive| primitive.hides(Light::Lamp)),
-        hides_sky: primitives.iter().any(|primitive| primitive.hides(Light::Sky)),
+        hides_lamp: primitives
+            .iter()
+            .any(|primitive| primitive.hides(Light::Lamp)),
+        hides_sky: primitives
+            .iter()
+            .any(|primitive| primitive.hides(Light::Sky)),
     });
     if primitives.len() <= LEAF {
         return;
     }
-    let centers = primitives
-        .iter()
-        .fold(Bounds::EMPTY, |bounds, primitive| {
-            bounds.joined(&Bounds::of([primitive.shape.bounds().center()]))
-        });
+    let centers = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&Bounds::of([primitive.shape.bounds().center()]))
+    });
     let axis = centers.half().imax();
     let middle = primitives.len() / 2;
     primitives.select_nth_unstable_by(middle, |a, b| {

@@ -112,7 +112,11 @@ pub struct Capture {
 impl Capture {
     /// `fwd` from Q1 to Q2, `back` the other way.
     pub fn direction(&self) -> &'static str {
-        if self.pass.is_multiple_of(2) { "fwd" } else { "back" }
+        if self.pass.is_multiple_of(2) {
+            "fwd"
+        } else {
+            "back"
+        }
     }
 }
 
@@ -213,7 +217,9 @@ impl Script {
     pub fn world_from_camera(&self, station: usize, frame: f64) -> Pose {
         let station = &self.stations[station];
         let odometer = station.drive.odometer(frame + 1.0);
-        station.arc.world_from_camera(odometer, self.seed, station.key)
+        station
+            .arc
+            .world_from_camera(odometer, self.seed, station.key)
     }
 
     /// The tracker's own sample number `tick` (25 a second since frame 0): time in seconds, and the LEDs.
@@ -228,7 +234,8 @@ impl Script {
         let at = &self.stations[station];
         let time = START_SECS + frame / FRAMES_PER_SECOND;
         // Two heads of one robot carry plates of their own.
-        self.tracker.observe(&at.rig, &pose, time, self.seed, 0x7_0000 + station as u64)
+        self.tracker
+            .observe(&at.rig, &pose, time, self.seed, 0x7_0000 + station as u64)
     }
 
     /// The scene at a frame, for whoever wants to look from elsewhere.
@@ -286,7 +293,9 @@ impl Script {
             scene: &scene,
             lighting: &self.lighting,
         };
-        let gain = 1.0 + self.sensor.exposure_drift * wander(self.seed, 0xe0 + station as u64, frame as f64 / 40.0);
+        let gain = 1.0
+            + self.sensor.exposure_drift
+                * wander(self.seed, 0xe0 + station as u64, frame as f64 / 40.0);
         let key = |camera: u64| [station as u64, frame, camera];
         let shot = |middle_from_camera: Option<&Pose>, camera: u64| {
             let pose_at = |frame: f64| {
@@ -375,7 +384,14 @@ impl Script {
     }
 
     /// An item's visible silhouette: where it is the first thing seen, or would be.
-    fn mask(&self, item: &Item, stands: bool, intrinsics: &Intrinsics, pose: &Pose, rendering: &Rendering) -> Vec<u8> {
+    fn mask(
+        &self,
+        item: &Item,
+        stands: bool,
+        intrinsics: &Intrinsics,
+        pose: &Pose,
+        rendering: &Rendering,
+    ) -> Vec<u8> {
         if stands {
             return rendering
                 .object
@@ -401,7 +417,11 @@ impl Script {
     }
 
     /// The middle camera's pose as a robot gets it: from the tracked LEDs.
-    pub fn localised(&self, station: usize, capture: &Capture) -> Result<(Pose, PlateFit), LocaliseError> {
+    pub fn localised(
+        &self,
+        station: usize,
+        capture: &Capture,
+    ) -> Result<(Pose, PlateFit), LocaliseError> {
         let rig = &self.stations[station].rig;
         let tracked: Vec<_> = capture.markers.iter().map(Marker::tracked).collect();
         let fit = fit_plate(&rig.marker_in_plate, &tracked, TOLERANCE_M)?;

@@ -1,6 +1,8 @@
 //! From radiance to what a camera delivers: exposure, shot and read noise, response curve, eight bits; and a depth
 //! camera's noise.
 
+use std::sync::LazyLock;
+
 use rayon::prelude::*;
 
 use super::{random::Stream, texture::Rgb};
@@ -46,7 +48,14 @@ impl Sensor {
     };
 
     /// An image of this radiance; `gain` multiplies the exposure, `key` tells images apart.
-    pub fn expose(&self, radiance: &[Rgb], width: usize, gain: f64, seed: u64, key: &[u64]) -> RgbImage {
+    pub fn expose(
+        &self,
+        radiance: &[Rgb],
+        width: usize,
+        gain: f64,
+        seed: u64,
+        key: &[u64],
+    ) -> RgbImage {
         let height = radiance.len() / width;
         let exposure = (self.exposure * gain) as f32;
         let shot = (1.0 / self.full_well) as f32;
@@ -67,7 +76,7 @@ impl Sensor {
                     if noisy {
                         signal += (shot * signal + read).sqrt() * stream.nearly_normal();
                     }
-                    *byte = (response(signal) * 255.0 + 0.5) as u8;
+                    *byte = level(&RESPONSE, signal);
                 }
             });
         RgbImage {
@@ -88,6 +97,23 @@ impl Sensor {
             .map(|&z| z + self.depth_noise_m as f32 * z * z * stream.nearly_normal())
             .collect()
     }
+}
+
+/// The response curve at `RESPONSE_STEPS` signals per unit, up to where it is white.
+static RESPONSE: LazyLock<Vec<f32>> = LazyLock::new(|| {
+    (0..=RESPONSE_STEPS * RESPONSE_END)
+        .map(|step| response(step as f32 / RESPONSE_STEPS as f32) * 255.0 + 0.5)
+        .collect()
+});
+const RESPONSE_STEPS: usize = 8192;
+const RESPONSE_END: usize = 2;
+
+/// Grey level of a signal.
+#[inline]
+fn level(table: &[f32], signal: f32) -> u8 {
+    // The casts saturate. A step is less than a tenth of a level but in the deepest shadow, where noise is greater.
+    let step = (signal * RESPONSE_STEPS as f32 + 0.5) as usize;
+    table[step.min(table.len() - 1)] as u8
 }
 
 /// The sRGB curve with a shoulder, so that highlights fade into white; linear 0.. -> 0..1.

@@ -130,7 +130,11 @@ impl Frustum {
         let along = top - base;
         let height = along.norm();
         let axis = along / height;
-        let helper = if axis.z.abs() < 0.9 { Vector3::z() } else { Vector3::x() };
+        let helper = if axis.z.abs() < 0.9 {
+            Vector3::z()
+        } else {
+            Vector3::x()
+        };
         let right = (helper - axis * helper.dot(&axis)).normalize();
         Self {
             base,
@@ -374,7 +378,10 @@ impl Shape {
                 let normal = solid.planes[part].0;
                 let offset = point - solid.origin;
                 let (u, v) = if normal.z.abs() > 0.99 {
-                    (offset.dot(&solid.right), offset.dot(&Vector3::z().cross(&solid.right)))
+                    (
+                        offset.dot(&solid.right),
+                        offset.dot(&Vector3::z().cross(&solid.right)),
+                    )
                 } else {
                     let right = Vector3::z().cross(&normal).normalize();
                     (offset.dot(&right), offset.z)
@@ -394,9 +401,7 @@ impl Shape {
             normal.map(|n| radius * (1.0 - n * n).max(0.0).sqrt())
         };
         match self {
-            Self::Sphere(sphere) => {
-                about(sphere.center, Vector3::from_element(sphere.radius))
-            }
+            Self::Sphere(sphere) => about(sphere.center, Vector3::from_element(sphere.radius)),
             Self::Ellipsoid(ellipsoid) => about(ellipsoid.center, ellipsoid.half),
             Self::Frustum(frustum) => about(frustum.base, ring(&frustum.axis, frustum.base_radius))
                 .joined(&about(

@@ -158,9 +158,27 @@ impl Story {
     pub fn objects() -> Self {
         const I2: f64 = 316.0;
         let shown = [
-            ("cup", Kind::YellowMug, on_table(-0.10, -0.17, -0.6), 40.0, 315.0),
-            ("milk", Kind::MilkCarton, on_table(-0.02, -0.08, 0.35), 435.0, 690.0),
-            ("coffee", Kind::CoffeeCan, on_table(0.04, -0.16, 0.0), 810.0, 1050.0),
+            (
+                "cup",
+                Kind::YellowMug,
+                on_table(-0.10, -0.17, -0.6),
+                40.0,
+                315.0,
+            ),
+            (
+                "milk",
+                Kind::MilkCarton,
+                on_table(-0.02, -0.08, 0.35),
+                435.0,
+                690.0,
+            ),
+            (
+                "coffee",
+                Kind::CoffeeCan,
+                on_table(0.04, -0.16, 0.0),
+                810.0,
+                1050.0,
+            ),
         ];
         let mut phases = vec![Phase {
             name: "I2",
@@ -208,8 +226,16 @@ impl Story {
     /// Things come and go for ever, as the seed says.
     pub fn patrol(seed: u64) -> Self {
         let spots: [(f64, f64, &[(&'static str, Kind)]); 4] = [
-            (-0.13, -0.13, &[("glass", Kind::Glass), ("apple", Kind::Apple)]),
-            (0.10, -0.21, &[("cup", Kind::BlackCup), ("mug", Kind::YellowMug)]),
+            (
+                -0.13,
+                -0.13,
+                &[("glass", Kind::Glass), ("apple", Kind::Apple)],
+            ),
+            (
+                0.10,
+                -0.21,
+                &[("cup", Kind::BlackCup), ("mug", Kind::YellowMug)],
+            ),
             (-0.36, -0.26, &[("milk", Kind::MilkCarton)]),
             (0.08, 0.03, &[("coffee", Kind::CoffeeCan)]),
         ];
@@ -244,14 +270,21 @@ impl Story {
         let count = spots.len() as u64;
         let (spot, turn) = ((window % count) as usize, window / count);
         // What was brought in an even turn is taken in the odd one after it.
-        let choice = Stream::new(seed, &[0xc4, spot as u64, turn / 2]).below(spots[spot].len() as u64);
+        let choice =
+            Stream::new(seed, &[0xc4, spot as u64, turn / 2]).below(spots[spot].len() as u64);
         let enters = 1.0
             + QUIET
             + window as f64 * WINDOW
-            + Stream::new(seed, &[0x3e, window]).between(0.0, WINDOW - 36.0).floor();
+            + Stream::new(seed, &[0x3e, window])
+                .between(0.0, WINDOW - 36.0)
+                .floor();
         Event {
             item: spots[spot][choice as usize],
-            change: if turn.is_multiple_of(2) { Change::Brought } else { Change::Taken },
+            change: if turn.is_multiple_of(2) {
+                Change::Brought
+            } else {
+                Change::Taken
+            },
             enters,
             acts: enters + 17.0,
             leaves: enters + 32.0,
@@ -261,9 +294,11 @@ impl Story {
     /// The event that is under way at `frame`, or else the last one before it.
     pub fn latest_event(&self, frame: f64) -> Option<Event> {
         match &self.plot {
-            Plot::Written { events, .. } => {
-                events.iter().rev().find(|event| event.enters <= frame).copied()
-            }
+            Plot::Written { events, .. } => events
+                .iter()
+                .rev()
+                .find(|event| event.enters <= frame)
+                .copied(),
             Plot::Endless { seed, spots } => {
                 let window = ((frame - 1.0 - QUIET) / WINDOW).floor();
                 [window, window - 1.0]
@@ -318,8 +353,14 @@ impl Story {
                 .find(|phase| phase.frames.contains(&frame))
                 .map_or(("", None), |phase| (phase.name, phase.evaluated)),
             Plot::Endless { .. } => (
-                if frame < 1.0 + QUIET { "learn" } else { "watch" },
-                latest.filter(|event| event.acts <= frame).map(|event| event.item),
+                if frame < 1.0 + QUIET {
+                    "learn"
+                } else {
+                    "watch"
+                },
+                latest
+                    .filter(|event| event.acts <= frame)
+                    .map(|event| event.item),
             ),
         };
         let visit = latest
@@ -346,7 +387,12 @@ impl Story {
         let at_table = Point3::new(-0.90, foot_of_item.y + 0.2, 0.0);
         let outside = at_table + Vector3::new(-0.8, -0.9, 0.0);
         let shoulder = at_table + Vector3::new(0.25, -0.2, 0.0);
-        let forward = Vector3::new(foot_of_item.x - shoulder.x, foot_of_item.y - shoulder.y, 0.0).normalize();
+        let forward = Vector3::new(
+            foot_of_item.x - shoulder.x,
+            foot_of_item.y - shoulder.y,
+            0.0,
+        )
+        .normalize();
         let at_item = foot_of_item - forward * (grip_radius_m + 0.021) + Vector3::z() * grip_height;
 
         let before = frame < event.acts;

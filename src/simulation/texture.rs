@@ -43,18 +43,54 @@ pub struct Spot {
 pub enum Pattern {
     Plain(Rgb),
     /// A tartan of unequal stripes with a woven grain.
-    Cloth { ground: Rgb, warp: Rgb, weft: Rgb, seed: u32 },
-    Planks { light: Rgb, dark: Rgb, width: f64, seed: u32 },
+    Cloth {
+        ground: Rgb,
+        warp: Rgb,
+        weft: Rgb,
+        seed: u32,
+    },
+    Planks {
+        light: Rgb,
+        dark: Rgb,
+        width: f64,
+        seed: u32,
+    },
     /// Painted plaster below a patterned paper.
-    Wallpaper { ground: Rgb, figure: Rgb, seed: u32 },
+    Wallpaper {
+        ground: Rgb,
+        figure: Rgb,
+        seed: u32,
+    },
     /// Cloud-like variation between two colours, `size` metres.
-    Mottled { a: Rgb, b: Rgb, size: f64, seed: u32 },
+    Mottled {
+        a: Rgb,
+        b: Rgb,
+        size: f64,
+        seed: u32,
+    },
     /// Rings around an upright object, `period` metres.
-    Rings { a: Rgb, b: Rgb, period: f64, share_of_b: f32 },
+    Rings {
+        a: Rgb,
+        b: Rgb,
+        period: f64,
+        share_of_b: f32,
+    },
     /// Knitted or woven stripes along v.
-    Knit { a: Rgb, b: Rgb, period: f64 },
-    Picture { width: f64, height: f64, seed: u32 },
-    Spine { ground: Rgb, ink: Rgb, seed: u32 },
+    Knit {
+        a: Rgb,
+        b: Rgb,
+        period: f64,
+    },
+    Picture {
+        width: f64,
+        height: f64,
+        seed: u32,
+    },
+    Spine {
+        ground: Rgb,
+        ink: Rgb,
+        seed: u32,
+    },
     Label(Label),
 }
 
@@ -168,10 +204,17 @@ fn stripes(x: f64, footprint: f64, seed: u32) -> f32 {
 impl Pattern {
     /// Linear RGB reflectance.
     pub fn colour(&self, spot: &Spot) -> Rgb {
-        let Spot { u, v, footprint, .. } = *spot;
+        let Spot {
+            u, v, footprint, ..
+        } = *spot;
         match self {
             Self::Plain(colour) => *colour,
-            Self::Cloth { ground, warp, weft, seed } => {
+            Self::Cloth {
+                ground,
+                warp,
+                weft,
+                seed,
+            } => {
                 let fold = f64::from(clouds(u, v, 0.11, 1, footprint, seed + 9)) * 0.004;
                 let along = stripes(u + fold, footprint, *seed);
                 let across = stripes(v + fold * 0.7 + 0.05, footprint, seed + 1);
@@ -197,7 +240,12 @@ impl Pattern {
                     + 0.05 * clouds(u, v, 0.2, 2, footprint, seed + 3);
                 scaled(colour, grain)
             }
-            Self::Planks { light, dark, width, seed } => {
+            Self::Planks {
+                light,
+                dark,
+                width,
+                seed,
+            } => {
                 let plank = (v / width).floor();
                 let lane = plank as i64;
                 let shift = f64::from(hash(lane, 0, *seed)) * 2.0;
@@ -207,16 +255,28 @@ impl Pattern {
                 let wave = f64::from(clouds(own, v, 0.25, 1, footprint, seed + 6)) * 0.02;
                 let grain = clouds(own * 0.12, v + wave, 0.016, 3, footprint, seed + 2)
                     + 0.5 * clouds(own * 0.3, v, 0.07, 2, footprint, seed + 3);
-                let colour = mixed(*light, *dark, (0.25 + 0.4 * tint + 0.45 * grain).clamp(0.0, 1.0));
+                let colour = mixed(
+                    *light,
+                    *dark,
+                    (0.25 + 0.4 * tint + 0.45 * grain).clamp(0.0, 1.0),
+                );
                 let gap = 0.0025;
                 let joint = between(v - plank * width, 0.0, gap, footprint)
                     + between(u + shift - length * 1.3, 0.0, gap, footprint);
                 scaled(colour, 1.0 - 0.65 * joint.min(1.0))
             }
-            Self::Wallpaper { ground, figure, seed } => {
+            Self::Wallpaper {
+                ground,
+                figure,
+                seed,
+            } => {
                 let (column, row) = ((u / 0.16).floor(), (v / 0.2).floor());
                 let odd = (column as i64).rem_euclid(2) as f64;
-                let row = if odd > 0.0 { ((v - 0.1) / 0.2).floor() } else { row };
+                let row = if odd > 0.0 {
+                    ((v - 0.1) / 0.2).floor()
+                } else {
+                    row
+                };
                 let du = u - (column + 0.5) * 0.16;
                 let dv = v - (row + 0.5) * 0.2 - odd * 0.1;
                 let angle = dv.atan2(du);
@@ -235,25 +295,46 @@ impl Pattern {
                 let share = 0.5 + 0.7 * clouds(u, v, *size, 3, footprint, *seed);
                 mixed(*a, *b, share.clamp(0.0, 1.0))
             }
-            Self::Rings { a, b, period, share_of_b } => {
+            Self::Rings {
+                a,
+                b,
+                period,
+                share_of_b,
+            } => {
                 let x = spot.v.rem_euclid(*period);
                 let width = f64::from(*share_of_b) * period;
-                mixed(*a, *b, between(x, (period - width) * 0.5, (period + width) * 0.5, footprint))
+                mixed(
+                    *a,
+                    *b,
+                    between(x, (period - width) * 0.5, (period + width) * 0.5, footprint),
+                )
             }
             Self::Knit { a, b, period } => {
-                let x = (v + 0.3 * period * f64::from(noise(u / period, v / period, 5))).rem_euclid(*period);
+                let x = (v + 0.3 * period * f64::from(noise(u / period, v / period, 5)))
+                    .rem_euclid(*period);
                 let line = between(x, 0.0, period * 0.4, footprint);
-                let grain = 1.0 + 0.16 * clouds(u, v, 0.012, 2, footprint, 31)
+                let grain = 1.0
+                    + 0.16 * clouds(u, v, 0.012, 2, footprint, 31)
                     + 0.2 * clouds(u, v, 0.09, 2, footprint, 32);
                 scaled(mixed(*a, *b, line), grain)
             }
-            Self::Picture { width, height, seed } => picture(spot, *width, *height, *seed),
+            Self::Picture {
+                width,
+                height,
+                seed,
+            } => picture(spot, *width, *height, *seed),
             Self::Spine { ground, ink, seed } => {
-                let title = f32::from(hash((v / 0.006).floor() as i64, (u / 0.004).floor() as i64, seed + 1) > 0.45)
-                    * between(v, 0.05, 0.13, footprint)
+                let title = f32::from(
+                    hash(
+                        (v / 0.006).floor() as i64,
+                        (u / 0.004).floor() as i64,
+                        seed + 1,
+                    ) > 0.45,
+                ) * between(v, 0.05, 0.13, footprint)
                     * between(u, -0.007, 0.007, footprint)
                     * kept(0.008, footprint);
-                let bands = between(v, 0.018, 0.026, footprint) + between(v, 0.150, 0.156, footprint);
+                let bands =
+                    between(v, 0.018, 0.026, footprint) + between(v, 0.150, 0.156, footprint);
                 let grain = 1.0 + 0.12 * clouds(u, v, 0.03, 2, footprint, *seed);
                 scaled(mixed(*ground, *ink, (title + bands).min(1.0) * 0.85), grain)
             }
@@ -264,14 +345,29 @@ impl Pattern {
 
 /// A painted landscape: sky, sun, hills and a field.
 fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
-    let Spot { u, v, footprint, .. } = *spot;
+    let Spot {
+        u, v, footprint, ..
+    } = *spot;
     let (x, y) = (u / width, v / height);
     let border = 0.025;
     if u.abs() > width * 0.5 - border || v < border || v > height - border {
-        return mixed(rgb(0x4a2f1a), rgb(0x8a6237), 0.5 + 0.5 * noise(u / 0.01, v / 0.05, seed));
+        return mixed(
+            rgb(0x4a2f1a),
+            rgb(0x8a6237),
+            0.5 + 0.5 * noise(u / 0.01, v / 0.05, seed),
+        );
     }
-    let sky = mixed(rgb(0xf0d9a8), rgb(0x5f93b8), (y as f32 * 1.4 - 0.4).clamp(0.0, 1.0));
-    let sun = 1.0 - above((x - 0.18).hypot((y - 0.72) * height / width), 0.07, footprint / width);
+    let sky = mixed(
+        rgb(0xf0d9a8),
+        rgb(0x5f93b8),
+        (y as f32 * 1.4 - 0.4).clamp(0.0, 1.0),
+    );
+    let sun = 1.0
+        - above(
+            (x - 0.18).hypot((y - 0.72) * height / width),
+            0.07,
+            footprint / width,
+        );
     let mut colour = mixed(sky, rgb(0xfff3c4), sun);
     let brush = 1.0 + 0.25 * clouds(u, v * 2.5, 0.03, 2, footprint, seed + 7);
     for (layer, (level, paint)) in [
@@ -293,18 +389,25 @@ fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
 
 impl Label {
     fn colour(&self, spot: &Spot) -> Rgb {
-        let Spot { u, v, footprint, .. } = *spot;
+        let Spot {
+            u, v, footprint, ..
+        } = *spot;
         let cell = (u / self.repeat).round();
         let x = u - cell * self.repeat;
         let wave = 0.004 * (x / self.repeat * std::f64::consts::TAU * 2.0).sin();
         let band = between(v, self.band_v.0 + wave, self.band_v.1 + wave, footprint);
-        let rim = between(v, self.band_v.1 + wave + 0.003, self.band_v.1 + wave + 0.006, footprint);
+        let rim = between(
+            v,
+            self.band_v.1 + wave + 0.003,
+            self.band_v.1 + wave + 0.006,
+            footprint,
+        );
         let mut colour = mixed(self.ground, self.band, (band + rim).min(1.0));
         // Small print and a round emblem below the name.
         let emblem_v = self.text_v - self.letter * 1.5;
         let emblem = x.hypot(v - emblem_v);
-        let ring = between(emblem, self.letter * 0.45, self.letter * 0.6, footprint)
-            + 1.0 - above(emblem, self.letter * 0.25, footprint);
+        let ring = between(emblem, self.letter * 0.45, self.letter * 0.6, footprint) + 1.0
+            - above(emblem, self.letter * 0.25, footprint);
         colour = mixed(colour, self.ink, ring.min(1.0) * 0.9);
         let line = ((v - 0.01) / 0.006).floor();
         let print = f32::from(hash((u / 0.004).floor() as i64, line as i64, self.seed) > 0.4)

@@ -3,7 +3,7 @@
 //! left out, glass only dims it.
 //!
 //! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
-//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get four more for colour.
+//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get three more for colour.
 
 use std::ops::Range;
 
@@ -20,8 +20,8 @@ use crate::model::{camera::Intrinsics, pose::Pose};
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
 const MAX_BOUNCES: u32 = 9;
-const LAMP_SAMPLES: usize = 14;
-const SKY_SAMPLES: usize = 7;
+const LAMP_SAMPLES: usize = 10;
+const SKY_SAMPLES: usize = 6;
 /// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
 const FEW_LAMP_SAMPLES: usize = 5;
 const FEW_SKY_SAMPLES: usize = 3;
@@ -191,7 +191,12 @@ struct Pyramid {
 }
 
 impl Pyramid {
-    fn over(camera: &Intrinsics, world_from_camera: &Pose, columns: Range<usize>, rows: Range<usize>) -> Self {
+    fn over(
+        camera: &Intrinsics,
+        world_from_camera: &Pose,
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) -> Self {
         let (left, right) = (columns.start as f64 - 1.0, columns.end as f64);
         let (top, bottom) = (rows.start as f64 - 1.0, rows.end as f64);
         let corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
@@ -288,13 +293,20 @@ fn seed_points<const N: usize>(twist: f64) -> [(f64, f64); N] {
     std::array::from_fn(|index| {
         let radius = ((index as f64 + 0.5) / N as f64).sqrt();
         let point = (radius * cos, radius * sin);
-        (sin, cos) = (sin * step_cos + cos * step_sin, cos * step_cos - sin * step_sin);
+        (sin, cos) = (
+            sin * step_cos + cos * step_sin,
+            cos * step_cos - sin * step_sin,
+        );
         point
     })
 }
 
 fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
-    let helper = if normal.z.abs() < 0.9 { Vector3::z() } else { Vector3::x() };
+    let helper = if normal.z.abs() < 0.9 {
+        Vector3::z()
+    } else {
+        Vector3::x()
+    };
     let right = helper.cross(normal).normalize();
     (right, normal.cross(&right))
 }
@@ -347,14 +359,20 @@ impl Tracer<'_> {
                     let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
                     for left in (0..width).step_by(TILE) {
                         let right = (left + TILE).min(width);
-                        let frame = Pyramid::over(camera, world_from_camera, left..right, top..top + height);
-                        let mut tile = Tile::over(&prints, left..right, top..top + height, |print| {
-                            let primitive = print.primitive;
-                            frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
-                                let shape = &self.scene.primitives()[primitive].shape;
-                                frame.nearest_m(shape).max(print.nearest_m)
-                            })
-                        });
+                        let frame = Pyramid::over(
+                            camera,
+                            world_from_camera,
+                            left..right,
+                            top..top + height,
+                        );
+                        let mut tile =
+                            Tile::over(&prints, left..right, top..top + height, |print| {
+                                let primitive = print.primitive;
+                                frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
+                                    let shape = &self.scene.primitives()[primitive].shape;
+                                    frame.nearest_m(shape).max(print.nearest_m)
+                                })
+                            });
                         let mut seen = Vec::with_capacity(TILE * TILE);
                         for row in 0..height {
                             for column in left..right {
@@ -367,7 +385,8 @@ impl Tracer<'_> {
                         self.look_around(&mut tile, &seen);
                         self.light(&tile, &seen, lit, width, scratch);
                         for (at, path, cos, hit) in seen {
-                            radiance[at] = self.shade(&path, hit.as_ref(), Some(lit[at]), None, scratch);
+                            radiance[at] =
+                                self.shade(&path, hit.as_ref(), Some(lit[at]), None, scratch);
                             let Some(hit) = hit else {
                                 continue;
                             };
@@ -376,7 +395,9 @@ impl Tracer<'_> {
                             object[at] = primitive.object;
                             through[at] = if primitive.is_glass() {
                                 self.scene
-                                    .nearest(&path.ray, hit.crossing.t, f64::INFINITY, |p| !p.is_glass())
+                                    .nearest(&path.ray, hit.crossing.t, f64::INFINITY, |p| {
+                                        !p.is_glass()
+                                    })
                                     .map_or(0.0, |hit| (hit.crossing.t * cos) as f32)
                             } else {
                                 depth[at]
@@ -407,11 +428,10 @@ impl Tracer<'_> {
                         (row + 1 < camera.height).then_some(here + width),
                     ];
                     let tile = &bands[row / TILE][column / TILE];
-                    let mut sum = scaled(*radiance, 0.2);
-                    for (index, (du, dv)) in
-                        [(-0.125, -0.375), (0.375, -0.125), (0.125, 0.375), (-0.375, 0.125)]
-                            .into_iter()
-                            .enumerate()
+                    let mut sum = scaled(*radiance, 0.25);
+                    for (index, (du, dv)) in [(-0.36, -0.12), (0.08, 0.37), (0.28, -0.25)]
+                        .into_iter()
+                        .enumerate()
                     {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
@@ -424,7 +444,7 @@ impl Tracer<'_> {
                                 .find(|lit| lit.face == (hit.primitive, hit.crossing.part))
                         });
                         let colour = self.shade(&path, hit.as_ref(), known, Some(tile), scratch);
-                        sum = plus(sum, scaled(colour, 0.2));
+                        sum = plus(sum, scaled(colour, 0.25));
                     }
                     *radiance = sum;
                 }
@@ -572,12 +592,24 @@ impl Tracer<'_> {
         let point = path.ray.at(hit.crossing.t);
         let surface = primitive.shape.surface(&point, hit.crossing.part);
         let facing = path.ray.direction.dot(&surface.normal) < 0.0;
-        let normal = if facing { surface.normal } else { -surface.normal };
+        let normal = if facing {
+            surface.normal
+        } else {
+            -surface.normal
+        };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
         // Seen in a mirror or through glass, fewer samples do.
         let few = path.few || path.bounces > 0;
-        let sky = if few { Self::sky_share::<FEW_SKY_SAMPLES> } else { Self::sky_share::<SKY_SAMPLES> };
-        let lamp = if few { Self::lamp_share::<FEW_LAMP_SAMPLES> } else { Self::lamp_share::<LAMP_SAMPLES> };
+        let sky = if few {
+            Self::sky_share::<FEW_SKY_SAMPLES>
+        } else {
+            Self::sky_share::<SKY_SAMPLES>
+        };
+        let lamp = if few {
+            Self::lamp_share::<FEW_LAMP_SAMPLES>
+        } else {
+            Self::lamp_share::<LAMP_SAMPLES>
+        };
         Lit {
             face: (hit.primitive, hit.crossing.part),
             sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
@@ -660,7 +692,10 @@ impl Tracer<'_> {
         let lamp_patch = patch(to_lamp.dot(direction) / distance, lamp.radius / distance);
         let (towards, light) = &self.lighting.window;
         let window_patch = patch(towards.dot(direction), 0.16);
-        plus(scaled(lamp.irradiance, lamp_patch * 14.0), scaled(*light, window_patch * 9.0))
+        plus(
+            scaled(lamp.irradiance, lamp_patch * 14.0),
+            scaled(*light, window_patch * 9.0),
+        )
     }
 
     fn glass(
@@ -676,7 +711,11 @@ impl Tracer<'_> {
         let outward = primitive.shape.surface(&point, hit.crossing.part).normal
             * if primitive.hollow { -1.0 } else { 1.0 };
         let entering = direction.dot(&outward) < 0.0;
-        let (normal, ratio) = if entering { (outward, 1.0 / index) } else { (-outward, index) };
+        let (normal, ratio) = if entering {
+            (outward, 1.0 / index)
+        } else {
+            (-outward, index)
+        };
         if path.bounces >= MAX_BOUNCES {
             return self.surroundings(&direction);
         }
@@ -695,7 +734,10 @@ impl Tracer<'_> {
             return self.trace(&onward(reflection, 1.0), scratch);
         };
         let share = fresnel(-direction.dot(&normal), -transmission.dot(&normal), ratio);
-        let through = scaled(self.trace(&onward(transmission, 1.0 - share), scratch), 0.985 * (1.0 - share));
+        let through = scaled(
+            self.trace(&onward(transmission, 1.0 - share), scratch),
+            0.985 * (1.0 - share),
+        );
         // Reflections inside the wall are many and faint: followed only where they are the view itself.
         if path.bounces > 1 || !entering {
             return plus(through, scaled(self.surroundings(&reflection), share));
@@ -720,7 +762,11 @@ impl Tracer<'_> {
         let point = path.ray.at(hit.crossing.t);
         let surface = primitive.shape.surface(&point, hit.crossing.part);
         let cos = -direction.dot(&surface.normal);
-        let (normal, cos) = if cos < 0.0 { (-surface.normal, -cos) } else { (surface.normal, cos) };
+        let (normal, cos) = if cos < 0.0 {
+            (-surface.normal, -cos)
+        } else {
+            (surface.normal, cos)
+        };
         let travelled = path.travelled + hit.crossing.t;
         let colour = primitive.material.pattern.colour(&Spot {
             u: surface.u,
@@ -742,7 +788,10 @@ impl Tracer<'_> {
         let distance = to_lamp.norm();
         let facing = (normal.dot(&to_lamp) / distance).max(0.0);
         let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
-        let light = plus(scaled(sky, lit.sky), scaled(lamp.irradiance, lit.lamp * falloff));
+        let light = plus(
+            scaled(sky, lit.sky),
+            scaled(lamp.irradiance, lit.lamp * falloff),
+        );
         let diffuse = times(colour, light);
         let Finish::Glossy {
             reflectance,
@@ -751,7 +800,8 @@ impl Tracer<'_> {
         else {
             return diffuse;
         };
-        let share = reflectance + (1.0 - reflectance) * (1.0 - cos as f32).powi(5) * (sharpness / 200.0).min(1.0);
+        let share = reflectance
+            + (1.0 - reflectance) * (1.0 - cos as f32).powi(5) * (sharpness / 200.0).min(1.0);
         let reflection = mirrored(&direction, &normal);
         let seen = if path.bounces < 2 && path.weight * share > FAINT {
             self.trace(
@@ -857,7 +907,11 @@ impl Tracer<'_> {
             for &caster in &scratch.casters {
                 let primitive = &self.scene.primitives()[caster as usize];
                 if primitive.shape.crossing(&ray, LIFT, distance).is_some() {
-                    share *= if primitive.is_glass() { GLASS_SHADOW } else { 0.0 };
+                    share *= if primitive.is_glass() {
+                        GLASS_SHADOW
+                    } else {
+                        0.0
+                    };
                     if share == 0.0 {
                         break;
                     }
@@ -882,12 +936,14 @@ fn rough(
     let here = row * width + column;
     let differs = |there: usize| {
         let (a, b) = (radiance[here], radiance[there]);
-        let contrast = (0..3)
-            .map(|i| (a[i] - b[i]).abs() / a[i].max(b[i]).max(0.05))
-            .fold(0.0, f32::max);
+        if object[here] != object[there] {
+            return true;
+        }
         // Textures are averaged over the pixel already; what is seen through glass is not.
-        let needless = lit[here].face == lit[there].face && lit[here].face != UNLIT.face;
-        object[here] != object[there] || (!needless && contrast > CONTRAST)
+        if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
+            return false;
+        }
+        (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
     };
     (column > 0 && differs(here - 1))
         || (column + 1 < width && differs(here + 1))
@@ -928,7 +984,11 @@ fn in_beam(
 
 /// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the
 /// silhouette of an object that stands, or would stand, in the scene.
-pub fn depth_alone(primitives: &[Primitive], camera: &Intrinsics, world_from_camera: &Pose) -> Vec<f32> {
+pub fn depth_alone(
+    primitives: &[Primitive],
+    camera: &Intrinsics,
+    world_from_camera: &Pose,
+) -> Vec<f32> {
     let mut depth = vec![f32::INFINITY; camera.pixels()];
     let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
         bounds.joined(&primitive.shape.bounds())
@@ -956,7 +1016,11 @@ fn window_of(bounds: &Bounds, camera: &Intrinsics, camera_from_world: &Pose) -> 
     let mut behind = 0;
     for corner in 0..8 {
         let pick = |axis: usize| {
-            if corner >> axis & 1 == 0 { bounds.min[axis] } else { bounds.max[axis] }
+            if corner >> axis & 1 == 0 {
+                bounds.min[axis]
+            } else {
+                bounds.max[axis]
+            }
         };
         let in_camera = camera_from_world * Point3::new(pick(0), pick(1), pick(2));
         if in_camera.z < 1e-3 {

@@ -48,7 +48,14 @@ impl Default for Tracker {
 
 impl Tracker {
     /// What the tracker says at `time_secs`; `key` tells robots apart.
-    pub fn observe(&self, rig: &Rig, world_from_camera: &Pose, time_secs: f64, seed: u64, key: u64) -> Vec<Marker> {
+    pub fn observe(
+        &self,
+        rig: &Rig,
+        world_from_camera: &Pose,
+        time_secs: f64,
+        seed: u64,
+        key: u64,
+    ) -> Vec<Marker> {
         let world_from_plate = world_from_camera * rig.camera_from_plate;
         let instant = (time_secs * 1e6).round() as i64 as u64;
         let mut stream = Stream::new(seed, &[key, instant]);
@@ -60,7 +67,8 @@ impl Tracker {
             .iter()
             .enumerate()
             .map(|(index, in_plate)| {
-                let hidden = Stream::new(seed, &[key, window, index as u64]).uniform() < self.hidden;
+                let hidden =
+                    Stream::new(seed, &[key, window, index as u64]).uniform() < self.hidden;
                 let mut in_world = world_from_plate * in_plate;
                 for value in in_world.iter_mut() {
                     *value += self.noise_m * stream.normal();

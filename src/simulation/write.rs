@@ -100,12 +100,19 @@ pub fn recording(dir: &Path, script: &Script, options: &Options) -> Result<Summa
     }
     let camera = &station.rig.intrinsics;
     let mut calibration = List::create(dir, "calibration.txt", "# fx fy cx cy")?;
-    calibration.line(&format!("{} {} {} {}", camera.fx, camera.fy, camera.cx, camera.cy))?;
+    calibration.line(&format!(
+        "{} {} {} {}",
+        camera.fx, camera.fy, camera.cx, camera.cy
+    ))?;
     calibration.finish()?;
     let mut rgb = List::create(dir, "rgb.txt", "# timestamp filename")?;
     let mut depth = List::create(dir, "depth.txt", "# timestamp filename")?;
     let mut poses = List::create(dir, "groundtruth.txt", "# timestamp tx ty tz qx qy qz qw")?;
-    let mut phases = List::create(dir, "phases.csv", "# timestamp,phase,pass,present,evaluated")?;
+    let mut phases = List::create(
+        dir,
+        "phases.csv",
+        "# timestamp,phase,pass,present,evaluated",
+    )?;
 
     let mut summary = Summary {
         frames: 0,
@@ -170,7 +177,12 @@ fn write_images(
     let image = &capture.middle.image;
     let (width, height) = (image.width as u32, image.height as u32);
     encode(dir.join(format!("rgb/{stamp}.jpg")), |file| {
-        JpegEncoder::new_with_quality(file, jpeg_quality).write_image(&image.data, width, height, ExtendedColorType::Rgb8)
+        JpegEncoder::new_with_quality(file, jpeg_quality).write_image(
+            &image.data,
+            width,
+            height,
+            ExtendedColorType::Rgb8,
+        )
     })?;
     let depth: Vec<u8> = depth_m
         .iter()
@@ -192,11 +204,13 @@ fn encode(
     path: PathBuf,
     write: impl FnOnce(&mut BufWriter<File>) -> image::ImageResult<()>,
 ) -> Result<(), WriteError> {
-    let result = File::create(&path).map(BufWriter::new).and_then(|mut file| {
-        Ok(write(&mut file).map(|()| file))
-    });
+    let result = File::create(&path)
+        .map(BufWriter::new)
+        .and_then(|mut file| Ok(write(&mut file).map(|()| file)));
     match result {
-        Ok(Ok(mut file)) => file.flush().map_err(|source| WriteError::Io { path, source }),
+        Ok(Ok(mut file)) => file
+            .flush()
+            .map_err(|source| WriteError::Io { path, source }),
         Ok(Err(source)) => Err(WriteError::Encode { path, source }),
         Err(source) => Err(WriteError::Io { path, source }),
     }

@@ -32,13 +32,17 @@ pub struct PlateFit {
 
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum LocaliseError {
-    #[error("the plate has {expected} markers but {got} were given: send all, the unseen ones as not visible")]
+    #[error(
+        "the plate has {expected} markers but {got} were given: send all, the unseen ones as not visible"
+    )]
     Count { expected: usize, got: usize },
     #[error("{visible} markers are tracked but the rotation needs {MIN_MARKERS}")]
     TooFew { visible: usize },
     #[error("the tracked markers lie on a line, which leaves the rotation about it open")]
     Collinear,
-    #[error("the markers are a mirror image of the plate: are two of them exchanged, or an axis of the tracker turned round?")]
+    #[error(
+        "the markers are a mirror image of the plate: are two of them exchanged, or an axis of the tracker turned round?"
+    )]
     Mirrored,
     #[error("the markers do not fit the plate: {:.1} mm RMS is the best of any choice", residual_m * 1e3)]
     Inconsistent { residual_m: f64 },
@@ -89,7 +93,10 @@ pub fn fit_plate(
         })
         .collect();
     if tracked.iter().any(|pair| {
-        pair.in_plate.iter().chain(pair.in_world.iter()).any(|value| !value.is_finite())
+        pair.in_plate
+            .iter()
+            .chain(pair.in_world.iter())
+            .any(|value| !value.is_finite())
     }) {
         return Err(LocaliseError::NotFinite);
     }
