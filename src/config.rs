@@ -297,11 +297,10 @@ pub enum ConfigError {
     #[error("settings: {0}")]
     File(toml::de::Error),
     #[error("{file}: {error}")]
-    Read {
-        file: String,
-        error: std::io::Error,
-    },
-    #[error("--root {0}: a root is a Zenoh key without wildcards, such as surprised or site/surprised")]
+    Read { file: String, error: std::io::Error },
+    #[error(
+        "--root {0}: a root is a Zenoh key without wildcards, such as surprised or site/surprised"
+    )]
     Root(String),
     #[error("Zenoh: {0}")]
     Zenoh(String),

@@ -23,6 +23,7 @@ def look(sequence: int) -> tuple[np.ndarray, np.ndarray]:
     rgb, depth_m = np.kron(paper, np.ones((8, 8, 1), np.uint8)), np.full((240, 320), 2.0, np.float32)
     if sequence >= 30:
         rgb[80:160, 130:190], depth_m[80:160, 130:190] = (200, 20, 20), 1.9
+    rgb += np.random.default_rng(sequence).integers(0, 7, rgb.shape, np.uint8)  # a sensor's noise
     return rgb, depth_m
 
 

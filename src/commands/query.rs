@@ -138,9 +138,7 @@ impl Prior {
         let reply: proto::PriorReply = decode::message(&answer)?;
         let png = match self.plane {
             Plane::Expected => reply.expected.context("the reply has no image")?.data,
-            Plane::Uncertainty => shown(reply.uncertainty, |bytes| {
-                float(bytes).sqrt() / 60.0
-            })?,
+            Plane::Uncertainty => shown(reply.uncertainty, |bytes| float(bytes).sqrt() / 60.0)?,
             Plane::Coverage => shown(reply.coverage, |bytes| f32::from(bytes[0]) / 7.0)?,
             Plane::Depth => shown(reply.depth, |bytes| float(bytes) / 10.0)?,
         };
@@ -167,6 +165,10 @@ fn shown(image: Option<proto::Image>, share: impl Fn(&[u8]) -> f32) -> anyhow::R
     if bytes_per_pixel == 0 {
         bail!("the reply's plane is empty");
     }
-    let values: Vec<f32> = image.data.chunks_exact(bytes_per_pixel).map(share).collect();
+    let values: Vec<f32> = image
+        .data
+        .chunks_exact(bytes_per_pixel)
+        .map(share)
+        .collect();
     Ok(picture::png(&picture::heat(width, height, &values, 1.0)))
 }

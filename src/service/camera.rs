@@ -118,7 +118,11 @@ impl Camera {
         }
     }
 
-    pub fn set_calibration(&mut self, calibration: Calibration, limits: Limits) -> Result<(), Refusal> {
+    pub fn set_calibration(
+        &mut self,
+        calibration: Calibration,
+        limits: Limits,
+    ) -> Result<(), Refusal> {
         let pixels = calibration.intrinsics.pixels();
         if pixels > limits.image_pixels_max {
             return Err(Refusal::new(
@@ -143,7 +147,12 @@ impl Camera {
     ///
     /// # Errors
     /// Everything that is wrong before pictures are unpacked, stamps that go back included.
-    pub fn receive(&mut self, arrival: Arrival, replaced: u64, limits: Limits) -> Result<(), Refused> {
+    pub fn receive(
+        &mut self,
+        arrival: Arrival,
+        replaced: u64,
+        limits: Limits,
+    ) -> Result<(), Refused> {
         let message: proto::Frame =
             decode::message(&arrival.payload.to_bytes()).map_err(|refusal| Refused {
                 refusal,
@@ -156,7 +165,8 @@ impl Camera {
             stamp_ns,
             sequence,
         };
-        let same = (Some(stamp_ns), Some(sequence)) == (self.order.last_ns(), self.status.last_sequence);
+        let same =
+            (Some(stamp_ns), Some(sequence)) == (self.order.last_ns(), self.status.last_sequence);
         if arrival.pulled && same {
             self.status.frames_repeated += 1;
             return Ok(());

@@ -109,20 +109,17 @@ impl Inbox {
         if !state.cameras.contains_key(source) {
             make_room(&mut state)?;
         }
-        let slot = state
-            .cameras
-            .entry(source.clone())
-            .or_insert_with(|| Slot {
-                frame: None,
-                replaced_since_taken: 0,
-                poses: VecDeque::new(),
-                calibration: None,
-                refused: VecDeque::new(),
-                live: false,
-                pulling: false,
-                heard: Instant::now(),
-                counters: SlotCounters::default(),
-            });
+        let slot = state.cameras.entry(source.clone()).or_insert_with(|| Slot {
+            frame: None,
+            replaced_since_taken: 0,
+            poses: VecDeque::new(),
+            calibration: None,
+            refused: VecDeque::new(),
+            live: false,
+            pulling: false,
+            heard: Instant::now(),
+            counters: SlotCounters::default(),
+        });
         slot.heard = Instant::now();
         put(slot);
         drop(state);

@@ -1,5 +1,5 @@
 //! From Zenoh to the places' inboxes. Callbacks run on Zenoh's few threads, so they move a message into a bounded slot
-//! or hand it on by `try_send`, and nothing else; a place is started by a task.
+//! or hand it on by `try_send`, and nothing else; a place's worker is started by a task.
 
 use std::{
     sync::{
@@ -9,10 +9,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::{
-    sync::mpsc::{self, error::TrySendError},
-    task::JoinHandle,
-};
+use tokio::{sync::mpsc, task::JoinHandle};
 use zenoh::{
     Session, Wait,
     bytes::{Encoding, ZBytes},
@@ -24,19 +21,20 @@ use zenoh::{
 use super::{
     camera::CALIBRATION_WAIT,
     inbox::{Arrival, Aside, Inbox},
-    places::Places,
+    places::{Places, Starts},
 };
 use crate::{
     model::{frame::Source, refusal::Refusal},
     wire::{
+        decode::Limits,
         encode,
         keys::{self, CameraPath},
         proto,
     },
 };
 
-/// Messages that wait for their place to be started, and refusals that no place can publish.
-const NEWCOMERS_MAX: usize = 64;
+/// Refusals to publish that no place's worker can.
+const REFUSALS_MAX: usize = 64;
 /// A robot that does not answer a pull within this time is asked again.
 const PULL_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -48,22 +46,17 @@ enum Message {
     Live(bool),
 }
 
-/// What a callback cannot do itself.
-#[derive(Debug)]
-enum Newcomer {
-    ForNewPlace(CameraPath, Message),
-    Refused(CameraPath, &'static str, Refusal),
-}
-
 /// Counted where no place could be blamed.
 #[derive(Debug, Default, serde::Serialize)]
 pub struct IngestCounters {
     /// Keys below the root that name no camera.
     pub bad_keys: AtomicU64,
-    /// Messages dropped while places were being started.
-    pub newcomers_dropped: AtomicU64,
     /// Refused because there are too many places or cameras.
     pub refused: AtomicU64,
+    /// Of these, how many were too many to be published.
+    pub refused_unpublished: AtomicU64,
+    /// Queries that found their queue full and ended without a reply.
+    pub queries_dropped: AtomicU64,
 }
 
 /// Ends with its value.
@@ -81,27 +74,32 @@ impl Drop for Ingest {
     }
 }
 
+/// Refused although no worker knows the camera.
+type Refused = (CameraPath, &'static str, Refusal);
+
 /// Where callbacks put things.
 #[derive(Clone)]
 struct Door {
     places: Arc<Places>,
-    newcomers: mpsc::Sender<Newcomer>,
+    limits: Limits,
+    refused: mpsc::Sender<Refused>,
     counters: Arc<IngestCounters>,
 }
 
 impl Door {
     /// Never waits.
     fn put(&self, path: CameraPath, leaf: &'static str, message: Message) {
-        let newcomer = match self.places.get(&path.place) {
-            None => Newcomer::ForNewPlace(path, message),
-            Some(place) => match put(&place.inbox, &path.source, message) {
-                Ok(()) => return,
-                Err(refusal) => Newcomer::Refused(path, leaf, refusal),
-            },
+        let put = self
+            .places
+            .get_or_open(&path.place)
+            .and_then(|place| put(&place.inbox, &path.source, message));
+        let Err(refusal) = put else {
+            return;
         };
-        if let Err(TrySendError::Full(_)) = self.newcomers.try_send(newcomer) {
+        self.counters.refused.fetch_add(1, Ordering::Relaxed);
+        if self.refused.try_send((path, leaf, refusal)).is_err() {
             self.counters
-                .newcomers_dropped
+                .refused_unpublished
                 .fetch_add(1, Ordering::Relaxed);
         }
     }
@@ -114,8 +112,7 @@ impl Door {
             self.bad_key(sample.key_expr().as_str());
             return;
         };
-        let limit = crate::wire::decode::Limits::new(&self.places.settings).message_bytes_max();
-        let checked = checked_payload(leaf, sample, limit);
+        let checked = checked_payload(leaf, sample, self.limits.message_bytes_max());
         let message = match checked {
             Err(refusal) => Message::Aside(Aside::Refused(leaf, refusal)),
             Ok(payload) => match leaf {
@@ -188,12 +185,13 @@ fn checked_payload(leaf: &str, sample: &Sample, bytes_max: usize) -> Result<ZByt
 ///
 /// # Errors
 /// What Zenoh says when the session is closing.
-pub fn start(places: &Arc<Places>) -> zenoh::Result<Ingest> {
-    let (newcomers, receiver) = mpsc::channel(NEWCOMERS_MAX);
+pub fn start(places: &Arc<Places>, starts: Starts) -> zenoh::Result<Ingest> {
+    let (refused, refusals) = mpsc::channel(REFUSALS_MAX);
     let counters = Arc::new(IngestCounters::default());
     let door = Door {
         places: places.clone(),
-        newcomers,
+        limits: Limits::new(&places.settings),
+        refused,
         counters: counters.clone(),
     };
     let session = &places.session;
@@ -216,11 +214,10 @@ pub fn start(places: &Arc<Places>) -> zenoh::Result<Ingest> {
             .callback(move |sample| live.live(&sample))
             .wait()?,
     );
-    let mut tasks = vec![tokio::spawn(welcome(
-        places.clone(),
-        receiver,
-        counters.clone(),
-    ))];
+    let mut tasks = vec![
+        tokio::spawn(start_places(places.clone(), starts)),
+        tokio::spawn(publish_refusals(places.clone(), refusals)),
+    ];
     if places.settings.pull_hz > 0.0 {
         tasks.push(tokio::spawn(pull(door)));
     }
@@ -231,26 +228,14 @@ pub fn start(places: &Arc<Places>) -> zenoh::Result<Ingest> {
     })
 }
 
-/// Starts places, and publishes refusals that no worker can.
-async fn welcome(
-    places: Arc<Places>,
-    mut newcomers: mpsc::Receiver<Newcomer>,
-    counters: Arc<IngestCounters>,
-) {
-    while let Some(newcomer) = newcomers.recv().await {
-        let (path, leaf, refusal) = match newcomer {
-            Newcomer::ForNewPlace(path, message) => {
-                let started = places
-                    .get_or_start(&path.place)
-                    .and_then(|place| put(&place.inbox, &path.source, message));
-                match started {
-                    Ok(()) => continue,
-                    Err(refusal) => (path, keys::FRAME, refusal),
-                }
-            }
-            Newcomer::Refused(path, leaf, refusal) => (path, leaf, refusal),
-        };
-        counters.refused.fetch_add(1, Ordering::Relaxed);
+async fn start_places(places: Arc<Places>, mut starts: Starts) {
+    while let Some(name) = starts.recv().await {
+        places.start(&name);
+    }
+}
+
+async fn publish_refusals(places: Arc<Places>, mut refusals: mpsc::Receiver<Refused>) {
+    while let Some((path, leaf, refusal)) = refusals.recv().await {
         let key = path.key(&places.root, leaf);
         tracing::debug!(code = refusal.code, "refused on {key}: {refusal}");
         let rejection = encode::rejection(&key, &refusal, 0, 0);
@@ -308,12 +293,11 @@ async fn pull(door: Door) {
 
 impl Door {
     fn pulled(&self, path: &CameraPath, reply: &Reply) {
-        let limit = crate::wire::decode::Limits::new(&self.places.settings).message_bytes_max();
         // A robot without a new frame may answer with an error: nothing is lost.
         let Ok(sample) = reply.result() else {
             return;
         };
-        let message = match checked_payload(keys::FRAME, sample, limit) {
+        let message = match checked_payload(keys::FRAME, sample, self.limits.message_bytes_max()) {
             Ok(payload) => Message::Frame(Arrival {
                 payload,
                 arrived: Instant::now(),

@@ -139,15 +139,11 @@ impl Service {
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let places = Arc::new(Places::new(
-            settings,
-            root.into(),
-            session,
-            Arc::new(pool),
-            failed,
-        ));
-        let ingest = ingest::start(&places).map_err(ServeError::Zenoh)?;
-        let queryable = queries::start(&places).map_err(ServeError::Zenoh)?;
+        let (places, starts) = Places::new(settings, root.into(), session, Arc::new(pool), failed);
+        let places = Arc::new(places);
+        let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
+        let queryable =
+            queries::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
         drop(workers_latch);
 
         let http = match listener {

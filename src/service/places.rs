@@ -3,7 +3,7 @@
 use std::{
     collections::BTreeMap,
     panic::{AssertUnwindSafe, catch_unwind},
-    sync::{Arc, PoisonError, RwLock},
+    sync::{Arc, Mutex, PoisonError, RwLock},
     thread::JoinHandle,
 };
 
@@ -12,12 +12,7 @@ use tokio::sync::{mpsc, watch};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use super::{inbox::Inbox, ingest, status::PlaceStatus, worker::Worker};
-use crate::{
-    config::Settings,
-    model::refusal::Refusal,
-    pipeline::Pipeline,
-    wire::keys,
-};
+use crate::{config::Settings, model::refusal::Refusal, pipeline::Pipeline, wire::keys};
 
 /// Each is a thread and a memory of up to `memory_bytes`.
 pub const PLACES_MAX: usize = 16;
@@ -27,7 +22,8 @@ pub const PLACES_MAX: usize = 16;
 pub struct Place {
     pub inbox: Arc<Inbox>,
     pub status: watch::Receiver<Arc<PlaceStatus>>,
-    _token: LivelinessToken,
+    /// Taken by the worker when it starts.
+    publish_status: Mutex<Option<watch::Sender<Arc<PlaceStatus>>>>,
 }
 
 pub struct Places {
@@ -36,10 +32,19 @@ pub struct Places {
     pub session: Session,
     pool: Arc<ThreadPool>,
     places: RwLock<BTreeMap<Arc<str>, Arc<Place>>>,
-    threads: std::sync::Mutex<Vec<JoinHandle<()>>>,
-    /// Told the name of each place whose worker has panicked.
+    running: Mutex<Vec<Running>>,
+    /// Told the name of each place whose worker has panicked or cannot start.
     failures: mpsc::UnboundedSender<String>,
+    starts: mpsc::Sender<Arc<str>>,
 }
+
+struct Running {
+    thread: JoinHandle<()>,
+    _token: LivelinessToken,
+}
+
+/// New places, for [`Places::start`]. There are never more than fit.
+pub type Starts = mpsc::Receiver<Arc<str>>;
 
 impl Places {
     pub fn new(
@@ -48,16 +53,19 @@ impl Places {
         session: Session,
         pool: Arc<ThreadPool>,
         failures: mpsc::UnboundedSender<String>,
-    ) -> Self {
-        Self {
+    ) -> (Self, Starts) {
+        let (starts, started) = mpsc::channel(PLACES_MAX);
+        let places = Self {
             settings,
             root,
             session,
             pool,
             places: RwLock::default(),
-            threads: std::sync::Mutex::default(),
+            running: Mutex::default(),
             failures,
-        }
+            starts,
+        };
+        (places, started)
     }
 
     pub fn get(&self, place: &str) -> Option<Arc<Place>> {
@@ -73,11 +81,15 @@ impl Places {
             .collect()
     }
 
-    /// The place, with its worker started if it is new. Not for Zenoh's callbacks: it declares.
+    /// The place. A new one has its inbox at once, so that nothing overtakes its first message, and its worker soon.
+    /// Never waits.
     ///
     /// # Errors
-    /// `too_many_places`; `closing` when the session or the threads are gone.
-    pub fn get_or_start(&self, name: &Arc<str>) -> Result<Arc<Place>, Refusal> {
+    /// `too_many_places`.
+    pub fn get_or_open(&self, name: &Arc<str>) -> Result<Arc<Place>, Refusal> {
+        if let Some(place) = self.get(name) {
+            return Ok(place);
+        }
         let mut places = self.places.write().unwrap_or_else(PoisonError::into_inner);
         if let Some(place) = places.get(name) {
             return Ok(place.clone());
@@ -90,48 +102,71 @@ impl Places {
                 ),
             ));
         }
-        let closing = |error: &dyn std::fmt::Display| {
-            Refusal::new(
-                "closing",
-                format!("the service cannot open another place: {error}"),
-            )
+        let status = Arc::new(PlaceStatus {
+            place: name.to_string(),
+            memory_bytes_max: self.settings.memory_bytes,
+            ..PlaceStatus::default()
+        });
+        let (publish_status, status) = watch::channel(status);
+        let place = Arc::new(Place {
+            inbox: Arc::default(),
+            status,
+            publish_status: Mutex::new(Some(publish_status)),
+        });
+        places.insert(name.clone(), place.clone());
+        // There is room for every place; the other end is gone only when the service is.
+        drop(self.starts.try_send(name.clone()));
+        Ok(place)
+    }
+
+    /// Starts the worker of a place that was opened. Not for Zenoh's callbacks: it declares.
+    pub fn start(&self, name: &Arc<str>) {
+        match self.try_start(name) {
+            Ok(()) => tracing::info!("place {name} begins"),
+            Err(error) => {
+                tracing::error!("place {name} cannot begin: {error}");
+                // Nobody listens when the service is stopping anyway.
+                drop(self.failures.send(name.to_string()));
+            }
+        }
+    }
+
+    fn try_start(&self, name: &Arc<str>) -> Result<(), Box<dyn std::error::Error + Send + Sync>> {
+        let Some(place) = self.get(name) else {
+            return Ok(());
+        };
+        let status = place
+            .publish_status
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .take();
+        let Some(status) = status else {
+            return Ok(());
         };
         let token = keys::live_service(&self.root, name, &self.session.zid().to_string());
-        let token = self
-            .session
-            .liveliness()
-            .declare_token(token)
-            .wait()
-            .map_err(|error| closing(&error))?;
-        let inbox = Arc::new(Inbox::default());
-        let (status, watched) = watch::channel(Arc::default());
+        let token = self.session.liveliness().declare_token(token).wait()?;
         let worker = Worker {
             place: name.clone(),
             root: self.root.clone(),
             session: self.session.clone(),
-            inbox: inbox.clone(),
+            inbox: place.inbox.clone(),
             pipeline: Pipeline::new(self.settings.clone(), self.pool.clone()),
             status,
             ask_calibration: ingest::calibration_getter(
                 self.session.clone(),
                 self.root.clone(),
-                inbox.clone(),
+                place.inbox.clone(),
             ),
         };
-        let thread = start_thread(name, self.failures.clone(), move || worker.run())
-            .map_err(|error| closing(&error))?;
-        self.threads
+        let thread = start_thread(name, self.failures.clone(), move || worker.run())?;
+        self.running
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
-            .push(thread);
-        let place = Arc::new(Place {
-            inbox,
-            status: watched,
-            _token: token,
-        });
-        tracing::info!("place {name} begins");
-        places.insert(name.clone(), place.clone());
-        Ok(place)
+            .push(Running {
+                thread,
+                _token: token,
+            });
+        Ok(())
     }
 
     /// Tells every worker to finish what has come, and waits for them. Blocks.
@@ -139,10 +174,10 @@ impl Places {
         for (_, place) in self.all() {
             place.inbox.close();
         }
-        let mut threads = self.threads.lock().unwrap_or_else(PoisonError::into_inner);
-        for thread in threads.drain(..) {
+        let mut running = self.running.lock().unwrap_or_else(PoisonError::into_inner);
+        for running in running.drain(..) {
             // A panic was already told of.
-            drop(thread.join());
+            drop(running.thread.join());
         }
     }
 }

@@ -2,10 +2,10 @@
 //!
 //! The request travels in the payload, or, in simple cases, in the selector's parameters, so that a plain `get` works:
 //! `prior?x=..;y=..;z=..;qx=..;qy=..;qz=..;qw=..;fx=..;fy=..;cx=..;cy=..;width=..;height=..;planes=expected,coverage`.
-//! Parameters win over the payload's robot-independent fields: `format=json` asks for JSON, and `robot=..;camera=..`
-//! lends an evaluated frame that camera's calibration and visit. Status is always JSON.
+//! `planes` wins over the payload's; `format=json` asks for JSON; `robot=..;camera=..` lends an evaluated frame that
+//! camera's calibration and visit. Status is always JSON.
 
-use std::sync::Arc;
+use std::sync::{Arc, atomic::Ordering};
 
 use tokio::sync::{Semaphore, mpsc, oneshot};
 use zenoh::{
@@ -18,6 +18,7 @@ use super::{
     ask::{Answer, Ask},
     camera::busy,
     inbox::ASKS_MAX,
+    ingest::IngestCounters,
     places::{Place, Places},
 };
 use crate::{
@@ -38,14 +39,18 @@ const QUESTIONS: [&str; 4] = ["prior", "evaluate", "views", "status"];
 ///
 /// # Errors
 /// What Zenoh says when the session is closing.
-pub fn start(places: &Arc<Places>) -> zenoh::Result<Queryable<()>> {
+pub fn start(places: &Arc<Places>, counters: Arc<IngestCounters>) -> zenoh::Result<Queryable<()>> {
     let (sender, mut queries) = mpsc::channel::<Query>(QUERIES_MAX);
     let queryable = places
         .session
         .declare_queryable(keys::memory(&places.root, "*", "*"))
         .complete(true)
-        // A query that finds the queue full is dropped here, which ends it without a reply.
-        .callback(move |query| drop(sender.try_send(query)))
+        .callback(move |query| {
+            // Dropping a query ends it without a reply: replying is nothing for a callback.
+            if sender.try_send(query).is_err() {
+                counters.queries_dropped.fetch_add(1, Ordering::Relaxed);
+            }
+        })
         .wait()?;
     let places = places.clone();
     let permits = Arc::new(Semaphore::new(QUERIES_MAX));
@@ -106,11 +111,7 @@ async fn answer(places: &Places, query: &Query) {
 
 async fn reply_refusal(query: &Query, refusal: &Refusal) {
     let text = format!("{}: {refusal}", refusal.code);
-    if let Err(error) = query
-        .reply_err(text)
-        .encoding(Encoding::TEXT_PLAIN)
-        .await
-    {
+    if let Err(error) = query.reply_err(text).encoding(Encoding::TEXT_PLAIN).await {
         tracing::debug!("no reply: {error}");
     }
 }
@@ -162,7 +163,10 @@ async fn reply_to(
             });
             payload(&reply.await?, parameters)
         }
-        "views" => payload(&ask(place, |answer| Ask::Views { answer }).await?, parameters),
+        "views" => payload(
+            &ask(place, |answer| Ask::Views { answer }).await?,
+            parameters,
+        ),
         _ => {
             let status = place.status.borrow().clone();
             let json = serde_json::to_vec(&*status).map_err(|error| {
@@ -188,10 +192,7 @@ pub async fn ask<T>(place: &Place, make: impl FnOnce(Answer<T>) -> Ask) -> Resul
         .unwrap_or_else(|_| Err(Refusal::new("closing", "the service is stopping")))
 }
 
-fn payload<M: encode::Named>(
-    message: &M,
-    parameters: &Parameters<'_>,
-) -> Result<Payload, Refusal> {
+fn payload<M: encode::Named>(message: &M, parameters: &Parameters<'_>) -> Result<Payload, Refusal> {
     match parameters.get("format") {
         None | Some("protobuf") => Ok(Payload(encode::bytes(message), keys::encoding::<M>())),
         Some("json") => Ok(Payload(

@@ -50,9 +50,9 @@ impl ZenohOptions {
             None => Config::default(),
         };
         let mut set = |key: &str, value: &str| {
-            config.insert_json5(key, value).map_err(|error| {
-                ConfigError::Zenoh(format!("{key} cannot be {value}: {error}"))
-            })
+            config
+                .insert_json5(key, value)
+                .map_err(|error| ConfigError::Zenoh(format!("{key} cannot be {value}: {error}")))
         };
         if let Some(mode) = &self.mode {
             set("mode", &json(mode))?;

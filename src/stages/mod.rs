@@ -6,6 +6,8 @@ pub mod pose_track;
 
 pub mod rectify;
 
+pub mod localise;
+
 pub mod select;
 
 pub mod refine;

@@ -65,8 +65,9 @@ impl PoseTrack {
         if after_ns == stamp_ns {
             return TrackedPose::At(world_from_after);
         }
-        let Some(&(before_ns, world_from_before)) =
-            after.checked_sub(1).and_then(|before| self.samples.get(before))
+        let Some(&(before_ns, world_from_before)) = after
+            .checked_sub(1)
+            .and_then(|before| self.samples.get(before))
         else {
             return TrackedPose::Never(Refusal::new(
                 "no_pose",

@@ -44,10 +44,7 @@ impl Rectifier {
             // NaN, of coefficients beyond reason, clamps to the corner.
             let (u, v) = (u.max(0.0).min(x_max), v.max(0.0).min(y_max));
             let (x, y) = (u as usize, v as usize);
-            let (right, below) = (
-                (x + 1).min(self.width - 1),
-                (y + 1).min(self.height - 1),
-            );
+            let (right, below) = ((x + 1).min(self.width - 1), (y + 1).min(self.height - 1));
             let (fx, fy) = (u - x as f32, v - y as f32);
             let at = |x: usize, y: usize, channel: usize| {
                 f32::from(distorted.data[3 * (y * self.width + x) + channel])
@@ -72,8 +69,8 @@ impl Rectifier {
             .iter()
             .map(|&(u, v)| {
                 let (x, y) = (u.round(), v.round());
-                let inside = (0.0..self.width as f32).contains(&x)
-                    && (0.0..self.height as f32).contains(&y);
+                let inside =
+                    (0.0..self.width as f32).contains(&x) && (0.0..self.height as f32).contains(&y);
                 if inside {
                     distorted_m[y as usize * self.width + x as usize]
                 } else {

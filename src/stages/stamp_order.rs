@@ -110,7 +110,10 @@ mod tests {
 
     #[test]
     fn a_wild_stamp_ahead_costs_no_later_frame() {
-        assert_eq!(accepted(&[10, 11, 5000, 12, 13, 14]), [10, 11, 5000, 12, 13, 14]);
+        assert_eq!(
+            accepted(&[10, 11, 5000, 12, 13, 14]),
+            [10, 11, 5000, 12, 13, 14]
+        );
     }
 
     #[test]

@@ -72,12 +72,12 @@ def test_a_recording_can_be_replayed_again(daemon, recording, place):
     assert replay(daemon, recording, place, "--lockstep").returncode == 0
     result = replay(daemon, recording, place, "--lockstep")
     assert result.returncode == 0, result.stderr
-    assert "12 frames" in result.stdout.splitlines()[-1]
+    # The robot's clock went back: that is believed from the third frame on.
+    assert "12 frames, 10 reports, 2 refused" in result.stdout.splitlines()[-1]
 
 
 def test_a_replay_to_nobody_fails_with_1_and_says_so(daemon, recording, place):
-    daemon_without_answers = ["--root", "nobody-listens-here"]
-    result = replay(daemon, recording, place, "--lockstep", *daemon_without_answers)
+    result = replay(daemon, recording, place, "--lockstep", "--root", "nobody-listens-here")
     assert result.returncode == 1
     assert "surprised serve" in result.stderr, result.stderr
 
@@ -123,7 +123,7 @@ def test_the_cup_on_the_table_is_found_in_four_of_five_frames_when_it_is_new(dae
             continue
         ys, xs = np.nonzero(np.asarray(Picture.open(tabletop / "mask" / "cup" / f"{stamp}.png")) > 127)
         cup = (xs.min(), ys.min(), xs.max() + 1, ys.max() + 1)
-        best = max((scene.overlap(scene.corners(region.box), cup) for region in report.regions), default=0.0)
-        found.append(best >= 0.5)
+        strongest = max(report.regions, key=lambda region: region.peak_surprise, default=None)
+        found.append(strongest is not None and scene.overlap(scene.corners(strongest.box), cup) >= 0.5)
     assert len(found) == len(new)
     assert np.mean(found) >= 0.8, json.dumps([int(hit) for hit in found])

@@ -95,11 +95,12 @@ pub fn start(listener: TcpListener, readiness: Readiness, parts: Parts) -> std::
     let (stop, stopped) = oneshot::channel::<()>();
     let router = router(App { readiness, parts });
     let task = tokio::spawn(async move {
-        let server = axum::serve(LimitedListener::new(listener), router)
-            .with_graceful_shutdown(async move {
+        let server = axum::serve(LimitedListener::new(listener), router).with_graceful_shutdown(
+            async move {
                 // Stopped, or dropped: both end it.
                 drop(stopped.await);
-            });
+            },
+        );
         if let Err(error) = server.await {
             tracing::error!("the HTTP server failed: {error}");
         }
@@ -122,9 +123,15 @@ fn router(app: App) -> Router {
         .route("/api/v1/places/{place}/views", get(views))
         .route(camera, get(camera_status))
         .route(&format!("{camera}/{{picture}}"), get(camera_picture))
-        .fallback(|| async { Problem::not_found("there is no such page: /api/v1/places is a start") })
+        .fallback(|| async {
+            Problem::not_found("there is no such page: /api/v1/places is a start")
+        })
         .method_not_allowed_fallback(|| async {
-            Problem::new(StatusCode::METHOD_NOT_ALLOWED, "method", "this page is read with GET")
+            Problem::new(
+                StatusCode::METHOD_NOT_ALLOWED,
+                "method",
+                "this page is read with GET",
+            )
         })
         .layer(TimeoutLayer::with_status_code(
             StatusCode::GATEWAY_TIMEOUT,
@@ -172,9 +179,10 @@ async fn places(State(app): State<App>) -> Json<Value> {
 }
 
 fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
-    app.parts.places.get(place).ok_or_else(|| {
-        Problem::not_found("this place is unknown: it begins with its first frame")
-    })
+    app.parts
+        .places
+        .get(place)
+        .ok_or_else(|| Problem::not_found("this place is unknown: it begins with its first frame"))
 }
 
 async fn place_status(

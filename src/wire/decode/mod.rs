@@ -265,10 +265,12 @@ fn pose_noise(position_m: f64, rotation_rad: f64) -> Result<Option<PoseNoise>, R
             ),
         ));
     }
-    Ok((position_m > 0.0 || rotation_rad > 0.0).then_some(PoseNoise {
-        position_m,
-        rotation_rad,
-    }))
+    Ok(
+        (position_m > 0.0 || rotation_rad > 0.0).then_some(PoseNoise {
+            position_m,
+            rotation_rad,
+        }),
+    )
 }
 
 fn required_stamp_ns(stamp: Option<&Timestamp>) -> Result<i64, Refusal> {
