@@ -62,7 +62,7 @@ def test_the_readme_shows_the_example_as_it_is():
 
 
 def test_every_option_of_the_readme_exists():
-    for line in re.findall(r"surprised (serve|replay|query) ([^`\n]*)", (ROOT / "README.md").read_text()):
+    for line in re.findall(r"(?:surprised|--) (serve|replay|query|evaluate) ([^`\n]*)", (ROOT / "README.md").read_text()):
         command, rest = line
         known = subprocess.run([BINARY, command, "--help"], capture_output=True, text=True, check=True).stdout
         for option in re.findall(r"(?<![\w-])--?[a-z][a-z-]*", rest):
