@@ -192,8 +192,11 @@ fn beside_differencing(settings: &Settings) -> Vec<Trial> {
     .into()
 }
 
+/// The settings with one step less.
+type TurnOff = fn(&mut Settings);
+
 fn leave_one_out(settings: &Settings) -> Vec<Trial> {
-    let steps: [(&str, fn(&mut Settings)); 11] = [
+    let steps: [(&str, TurnOff); 11] = [
         ("preset", |_| ()),
         ("- refine_pose", |s| s.refine_pose = false),
         ("- fresh_views", |s| s.fresh_views = false),
