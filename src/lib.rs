@@ -1,1 +1,7 @@
+pub mod engine;
 
+pub mod evaluation;
+
+pub mod model;
+
+pub mod stages;

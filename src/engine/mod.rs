@@ -1,0 +1,3 @@
+//! Where the stages are computed.
+
+pub mod isa;

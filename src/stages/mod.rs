@@ -1,0 +1,3 @@
+//! What is computed, one room a stage.
+
+pub mod depth;
