@@ -1,1 +1,3 @@
 //! How good it is.
+
+pub mod stereo;

@@ -1,10 +1,180 @@
-//! Depth from three cameras.
+//! Depth from three cameras, online (the paper's section III-C; the paper computes it offline).
+//! In: luminance of the middle, left and right camera, the rig. Out: depth of the middle image, metres.
+//! Open in the paper: see [`plane_sweep`], [`belief_propagation`] and [`refine`], in this order.
 
 mod belief_propagation;
 mod checkerboard;
 mod lanes;
 mod messages;
+mod plane_sweep;
+mod refine;
 
 pub use belief_propagation::{BeliefPropagation, Contrast, PropagationSettings, Smoothness};
 pub use checkerboard::CostVolume;
 pub use messages::Belief;
+pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
+
+use crate::engine::isa::Isa;
+use plane_sweep::{Middle, Side};
+use rayon::prelude::*;
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct DepthSettings {
+    pub sweep: SweepSettings,
+    pub propagation: PropagationSettings,
+    /// Grey levels between neighbours above which depth may jump more cheaply.
+    pub contrast: u8,
+}
+
+impl Default for DepthSettings {
+    fn default() -> Self {
+        Self {
+            sweep: SweepSettings { most_difference: 15, occlusion: 3, most_surprise: 2 },
+            propagation: PropagationSettings {
+                smooth: Smoothness { step: 3, truncation: 20 },
+                across_contrast: Smoothness { step: 2, truncation: 10 },
+                levels: 5,
+                iterations: 5,
+            },
+            contrast: 8,
+        }
+    }
+}
+
+/// Bits of [`DepthMap::seen_by`].
+pub const SEEN_BY_LEFT: u8 = 1;
+pub const SEEN_BY_RIGHT: u8 = 2;
+
+/// What is known of the middle image's depth; each `width * height`, row by row.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct DepthMap {
+    /// Metres along the optical axis; 0 = nothing can be said.
+    pub depth_m: Vec<f32>,
+    /// From 0, another depth is as likely, to 1.
+    pub confidence: Vec<f32>,
+    /// Which sides see the pixel: [`SEEN_BY_LEFT`], [`SEEN_BY_RIGHT`].
+    pub seen_by: Vec<u8>,
+    /// The best guess everywhere, also where `depth_m` is 0, 1/m.
+    pub inverse_depth: Vec<f32>,
+    /// Inverse depth from one hypothesis to the next, 1/m: surfaces are known no better than a fraction of it.
+    pub label_step: f32,
+}
+
+/// Estimates depth, frame after frame, in the same buffers.
+pub struct DepthEstimator {
+    settings: DepthSettings,
+    isa: Isa,
+    propagation: Option<BeliefPropagation>,
+    size: (usize, usize, usize),
+    sides: [Side; 2],
+    contrast: Contrast,
+    along_rows: Vec<f32>,
+    nearest: Vec<u8>,
+    map: DepthMap,
+}
+
+impl DepthEstimator {
+    pub fn new(settings: DepthSettings) -> Self {
+        Self::with_isa(settings, Isa::detect())
+    }
+
+    /// As [`new`](Self::new) with at most that instruction set; the depth is the same.
+    pub fn with_isa(settings: DepthSettings, isa: Isa) -> Self {
+        Self {
+            settings,
+            isa: isa.or_best_available(),
+            propagation: None,
+            size: (0, 0, 0),
+            sides: Default::default(),
+            contrast: Contrast::default(),
+            along_rows: Vec::new(),
+            nearest: Vec::new(),
+            map: DepthMap::default(),
+        }
+    }
+
+    /// Depth of the middle image from luminances of the sizes that the rig says; that of a side the rig lacks is not
+    /// looked at. `expected_depth_m` (of the middle image, 0 = none) decides where the images leave it open: all
+    /// hypotheses of `range` are tried at every pixel, so that nothing new stays hidden behind an expectation.
+    pub fn estimate(
+        &mut self,
+        rig: &DepthRig,
+        middle_y: &[u8],
+        left_y: &[u8],
+        right_y: &[u8],
+        range: &InverseDepthRange,
+        expected_depth_m: Option<&[f32]>,
+    ) -> &DepthMap {
+        let (width, height) = (rig.middle.width, rig.middle.height);
+        let pixels = width * height;
+        assert_eq!(middle_y.len(), pixels, "the middle image has its camera's size");
+        assert!(expected_depth_m.is_none_or(|depth_m| depth_m.len() == pixels), "one expected depth a pixel");
+        let cameras = [(rig.left, left_y), (rig.right, right_y)];
+        for (side, (camera, luminance)) in self.sides.iter_mut().zip(cameras) {
+            if let Some(camera) = camera {
+                assert_eq!(luminance.len(), camera.intrinsics.pixels(), "a side image has its camera's size");
+                let exposure = plane_sweep::match_exposure(middle_y, luminance);
+                side.turn(&rig.middle, &camera, range, &exposure, luminance);
+            }
+        }
+        let [left, right] = &self.sides;
+        let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
+
+        let size = (width, height, range.labels);
+        if self.size != size {
+            self.propagation = None;
+            self.size = size;
+        }
+        let (isa, settings) = (self.isa, &self.settings);
+        let propagation = self
+            .propagation
+            .get_or_insert_with(|| BeliefPropagation::new(settings.propagation, width, height, range.labels, isa));
+        let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
+        plane_sweep::sweep(isa, &settings.sweep, &middle, sides, range, propagation.costs_mut());
+        find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
+        let beliefs = propagation.solve(settings.sweep.highest_cost(), &self.contrast);
+
+        let map = &mut self.map;
+        map.label_step = range.step() as f32;
+        map.inverse_depth.resize(pixels, 0.0);
+        self.along_rows.resize(pixels, 0.0);
+        refine::refine(beliefs, width, &mut self.along_rows, &mut map.inverse_depth);
+        map.seen_by.clear();
+        map.seen_by.resize(pixels, 0);
+        for (side, bit) in sides.iter().zip([SEEN_BY_LEFT, SEEN_BY_RIGHT]) {
+            if let Some(side) = side {
+                refine::mark_seen(side, range, beliefs, width, bit, &mut self.nearest, &mut map.seen_by);
+            }
+        }
+        map.depth_m.resize(pixels, 0.0);
+        map.confidence.resize(pixels, 0.0);
+        let certain = f32::from(settings.sweep.most_difference);
+        let outputs = map
+            .depth_m
+            .par_iter_mut()
+            .zip(&mut map.confidence)
+            .zip(&mut map.inverse_depth)
+            .with_min_len(4096);
+        outputs.zip(beliefs).zip(&map.seen_by).for_each(|((((depth_m, confidence), label), belief), seen_by)| {
+            let inverse_depth = range.far as f32 + *label * range.step() as f32;
+            *label = inverse_depth;
+            let margin = f32::from(belief.rival_cost - belief.cost);
+            *confidence = if *seen_by == 0 { 0.0 } else { (margin / certain).min(1.0) };
+            // Infinitely far is no depth either.
+            *depth_m = if *confidence > 0.0 && inverse_depth > 0.0 { 1.0 / inverse_depth } else { 0.0 };
+        });
+        &self.map
+    }
+}
+
+fn find_contrast(luminance: &[u8], width: usize, threshold: u8, contrast: &mut Contrast) {
+    let Contrast { right, below } = contrast;
+    right.resize(luminance.len(), 0);
+    below.resize(luminance.len(), 0);
+    for (to, (a, b)) in right.iter_mut().zip(luminance.iter().zip(&luminance[1..])) {
+        *to = u8::from(a.abs_diff(*b) > threshold);
+    }
+    for (to, (a, b)) in below.iter_mut().zip(luminance.iter().zip(&luminance[width..])) {
+        *to = u8::from(a.abs_diff(*b) > threshold);
+    }
+}
