@@ -9,16 +9,18 @@
 //!
 //! Time goes into memory, not arithmetic, if each iteration walks the whole volume. So the iterations follow one
 //! another down the image one row apart, which is exact on a checkerboard: iteration t at row y needs iteration t - 1
-//! at rows y - 1 to y + 1 and nothing later. Bands of rows, one a thread, shrink by one row an iteration at each
-//! inner border; the wedge between two bands is done when both are.
+//! at rows y - 1 to y + 1 and nothing later. Messages then live in a ring of a few rows that stays in the cache; only
+//! what a level hands down to the next finer one is stored. Each thread has a band of rows and, at inner borders, also
+//! does the rows beyond that its own depend on, one less an iteration.
 
 use super::{
-    checkerboard::{AlignedBytes, Checkerboard, CostVolume},
+    checkerboard::{AlignedBytes, Checkerboard, CostRow, CostVolume},
     lanes::{Lanes, for_each_isa},
     messages::{self, ABOVE, BELOW, Belief, LEFT, RIGHT, Sender},
 };
 use crate::engine::isa::Isa;
 use rayon::prelude::*;
+use std::ops::Range;
 
 /// Cost of a difference of labels between neighbours: min(step * difference, truncation).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -41,7 +43,7 @@ pub struct PropagationSettings {
     pub across_contrast: Smoothness,
     /// Resolutions, each half the one before; 1 to [`MOST_LEVELS`](Self::MOST_LEVELS).
     pub levels: usize,
-    /// At each level; at least 1. Each updates one colour of the checkerboard.
+    /// At each level; at least 2, as each updates one colour of the checkerboard.
     pub iterations: usize,
 }
 
@@ -66,10 +68,14 @@ pub struct Contrast {
 
 struct Level {
     costs: CostVolume,
-    /// `[row][colour][neighbour][label][index]`
-    messages: AlignedBytes,
     /// `[row][colour][8][index]`, see [`Sender::weights`].
     weights: AlignedBytes,
+    /// First messages of the rows `2 y` and `2 y + 1`, `[y][neighbour][label][index]`: what the coarser level handed
+    /// down, or one row of zeros at the coarsest. Only what colour 0 receives is ever read, as iteration 0 rewrites
+    /// what colour 1 does, and each pixel of one colour has its own 2x2 parent: its index is the parent's x.
+    first: AlignedBytes,
+    /// Messages of a few consecutive rows, one ring a band: row `y` in slot `y % slots`, `[colour][neighbour][label][index]`.
+    rings: Vec<Vec<AlignedBytes>>,
 }
 
 /// Buffers for one image size and number of labels, and the propagation in them.
@@ -87,130 +93,143 @@ impl BeliefPropagation {
             assert!(truncation <= Smoothness::HIGHEST_TRUNCATION, "sums of messages fit a byte");
         }
         assert!((1..=PropagationSettings::MOST_LEVELS).contains(&settings.levels));
-        assert!(settings.iterations > 0);
+        assert!(settings.iterations >= 2, "both colours have their turn");
         let mut board = Checkerboard::new(width, height);
         let mut levels = Vec::new();
-        for _ in 0..settings.levels {
-            let costs = CostVolume::new(board.width, board.height, labels);
+        loop {
+            let coarsest = levels.len() + 1 == settings.levels || board.width.max(board.height) == 1;
+            let rows = if coarsest { 1 } else { board.height.div_ceil(2) };
             let mut level = Level {
-                messages: AlignedBytes::zeroed(4 * costs.bytes.len()),
+                costs: CostVolume::new(board.width, board.height, labels),
                 weights: AlignedBytes::zeroed(16 * board.height * board.stride),
-                costs,
+                first: AlignedBytes::zeroed(rows * 4 * labels * board.stride),
+                rings: Vec::new(),
             };
             level.weigh(&settings, None);
             levels.push(level);
-            if board.width <= 1 && board.height <= 1 {
+            if coarsest {
                 break;
             }
             board = board.coarser();
         }
-        Self { settings, isa: isa.or_best_available(), levels, beliefs: vec![Belief::default(); width * height] }
-    }
-
-    /// The costs of the next [`solve`](Self::solve), which may lower all costs of a pixel alike and those far above its
-    /// least.
-    pub fn costs_mut(&mut self) -> &mut CostVolume {
-        &mut self.levels[0].costs
+        Self {
+            settings,
+            isa: isa.or_best_available(),
+            levels,
+            beliefs: vec![Belief::default(); width * height],
+        }
     }
 
     pub fn costs(&self) -> &CostVolume {
         &self.levels[0].costs
     }
 
-    /// Beliefs of all pixels, row by row. `highest_cost` bounds what [`costs_mut`](Self::costs_mut) was given. Runs on
-    /// the threads of the current rayon pool; the result does not depend on their number.
-    pub fn solve(&mut self, highest_cost: u8, contrast: &Contrast) -> &[Belief] {
-        self.levels[0].weigh(&self.settings, Some(contrast));
-        // Before the finest are cut, so that coarser sums are exact.
-        self.build_coarser();
-        if highest_cost > self.settings.saturation() {
-            self.saturate();
-        }
-        let Self { settings, isa, levels, beliefs } = self;
-        for at in (0..levels.len()).rev() {
-            let (finer, coarser) = levels.split_at_mut(at + 1);
-            let level = &mut finer[at];
-            let beliefs = (at == 0).then_some(&mut beliefs[..]);
-            propagate(level, coarser.first(), settings.iterations, *isa, beliefs);
-        }
-        &self.beliefs
-    }
-
-    /// Cuts the finest costs to what messages can hold.
-    fn saturate(&mut self) {
+    /// Sets the costs of the next [`solve`](Self::solve), row by row: `fill_row(state, y, row)` with a state from `init`
+    /// for each thread's piece of work. `highest_cost` bounds what it writes; costs may be lowered afterwards by their
+    /// pixel's least, and what is far above it cut.
+    pub fn fill<S>(
+        &mut self,
+        highest_cost: u8,
+        init: impl Fn() -> S + Sync + Send,
+        fill_row: impl Fn(&mut S, usize, &mut CostRow<'_>) + Sync + Send,
+    ) {
         let (isa, highest) = (self.isa, self.settings.saturation());
-        let volume = &mut self.levels[0].costs;
-        let half_row = volume.row_bytes() / 2;
-        let (labels, stride) = (volume.labels, volume.board.stride);
-        volume.bytes.par_chunks_exact_mut(half_row).for_each(|half_row| {
-            assert_eq!(half_row.len(), labels * stride);
-            // SAFETY: `isa` is available; the half row has `labels` rows of `stride` bytes.
-            unsafe { saturate_half_row(isa, half_row.as_mut_ptr(), labels, stride, highest) };
-        });
-    }
-
-    /// Sums the costs of 2x2 pixels, level by level.
-    fn build_coarser(&mut self) {
-        let (isa, highest) = (self.isa, self.settings.saturation());
+        let cut = highest_cost > highest;
         let (finest, coarser) = self.levels.split_at_mut(1);
-        let finest = &finest[0].costs;
-        if coarser.is_empty() {
-            return;
-        }
-        // One strip makes one row of the coarsest level.
-        let mut strips: Vec<Vec<&mut [u8]>> = Vec::new();
-        let rows_of_coarsest = 1 << (coarser.len() - 1);
-        let labels = finest.labels;
+        let finest = &mut finest[0].costs;
+        let (labels, board) = (finest.labels, finest.board);
+        let finest_row = finest.row_bytes();
         let boards: Vec<Checkerboard> = coarser.iter().map(|level| level.costs.board).collect();
+        // One strip makes one row of the coarsest level, while its rows are in the cache.
+        let rows = 1 << coarser.len();
+        let mut strips: Vec<(&mut [u8], Vec<&mut [u8]>)> =
+            finest.bytes.chunks_mut(finest_row * rows).map(|strip| (strip, Vec::new())).collect();
         for (depth, level) in coarser.iter_mut().enumerate() {
-            let rows = rows_of_coarsest >> depth;
-            let bytes = level.costs.row_bytes() * rows;
-            for (strip, chunk) in level.costs.bytes.chunks_mut(bytes).enumerate() {
-                match strips.get_mut(strip) {
-                    Some(levels) => levels.push(chunk),
-                    None => strips.push(vec![chunk]),
-                }
+            let bytes = level.costs.row_bytes() * (rows >> (depth + 1));
+            for ((_, levels), chunk) in strips.iter_mut().zip(level.costs.bytes.chunks_mut(bytes)) {
+                levels.push(chunk);
             }
         }
+        let sums = || boards.iter().map(|board| vec![0_u16; labels * board.width]).collect::<Vec<_>>();
         strips.par_iter_mut().enumerate().for_each_init(
-            || {
-                boards
-                    .iter()
-                    .map(|board| vec![0_u16; labels * board.width])
-                    .collect::<Vec<_>>()
-            },
-            |sums, (strip, levels)| {
-                let first = strip * rows_of_coarsest * 2;
-                let rows = first..(first + 2 * rows_of_coarsest).min(finest.board.height);
-                for y in rows {
-                    sum_into(
-                        isa,
-                        &mut sums[0],
-                        boards[0].width,
-                        finest.half_row(y, 0),
-                        finest.half_row(y, 1),
-                        finest.board.stride,
-                        y % 2 == 0,
-                    );
+            || (init(), sums()),
+            |(state, sums), (strip, (finest, levels))| {
+                for (row, costs) in finest.chunks_exact_mut(finest_row).enumerate() {
+                    let y = strip * rows + row;
+                    fill_row(state, y, &mut CostRow { y, board: &board, labels, bytes: costs });
+                    // Before the costs are cut, so that coarser sums are exact.
+                    if let Some(sums) = sums.first_mut() {
+                        let (a, b) = costs.split_at(finest_row / 2);
+                        sum_into(isa, sums, boards[0].width, a, b, board.stride, y % 2 == 0);
+                    }
+                    if cut {
+                        for half_row in costs.chunks_exact_mut(finest_row / 2) {
+                            saturate(isa, half_row, board.stride, highest);
+                        }
+                    }
                     // Rows that end here, at each level.
-                    let (mut y, mut last) = (y, finest.board.height - 1);
-                    for depth in 0..levels.len() {
+                    let (mut y, mut last) = (y, board.height - 1);
+                    for (depth, level) in levels.iter_mut().enumerate() {
                         if y % 2 == 0 && y != last {
                             break;
                         }
                         (y, last) = (y / 2, last / 2);
-                        let (board, rows) = (boards[depth], rows_of_coarsest >> depth);
-                        let bytes = 2 * labels * board.stride;
-                        let row = &mut levels[depth][(y % rows) * bytes..][..bytes];
-                        let (sum, rest) = sums[depth..].split_first_mut().expect("one a level");
-                        cut_into(isa, sum, &board, y, highest, row);
+                        let bytes = 2 * labels * boards[depth].stride;
+                        let row = &mut level[y % (rows >> (depth + 1)) * bytes..][..bytes];
+                        let (sum, rest) = sums[depth..].split_at_mut(1);
+                        cut_into(isa, &sum[0], &boards[depth], y, highest, row);
                         if let Some(next) = rest.first_mut() {
-                            sum_pairs(sum, board.width, next, boards[depth + 1].width, y % 2 == 0);
+                            sum_pairs(&sum[0], boards[depth].width, next, boards[depth + 1].width, y % 2 == 0);
                         }
                     }
                 }
             },
         );
+    }
+
+    /// Beliefs of all pixels, row by row. Runs on the threads of the current rayon pool; the result does not depend on
+    /// their number.
+    pub fn solve(&mut self, contrast: &Contrast) -> &[Belief] {
+        self.levels[0].weigh(&self.settings, Some(contrast));
+        for at in (0..self.levels.len()).rev() {
+            self.propagate(at);
+        }
+        &self.beliefs
+    }
+
+    /// All iterations of one level, and then what the next finer one or the caller gets.
+    fn propagate(&mut self, at: usize) {
+        let Self { settings, isa, levels, beliefs } = self;
+        let (finer, level) = levels.split_at_mut(at);
+        let Level { costs, weights, first, rings } = &mut level[0];
+        let Checkerboard { width, height, stride, .. } = costs.board;
+        // A narrow band would do more rows of its neighbours than of its own.
+        let bands = rayon::current_num_threads().min(height / (4 * (settings.iterations + 1))).max(1);
+        let rows = height.div_ceil(bands);
+        let bands = height.div_ceil(rows);
+        // Even, so that each slot keeps its parity, and what nobody sends at the left and right border stays 0.
+        let slots = (settings.iterations + 3).next_multiple_of(2);
+        rings.resize_with(bands, || (0..slots).map(|_| AlignedBytes::zeroed(8 * costs.labels * stride)).collect());
+        let walk = Walk { costs, weights, first, iterations: settings.iterations, isa: *isa };
+        let outputs: Vec<Output<'_>> = match finer.last_mut() {
+            None => beliefs.chunks_mut(width * rows).map(Output::Beliefs).collect(),
+            Some(finer) => {
+                let (labels, stride) = (finer.costs.labels, finer.costs.board.stride);
+                finer
+                    .first
+                    .chunks_mut(4 * labels * stride * rows)
+                    .map(|first| Output::First { first, stride })
+                    .collect()
+            }
+        };
+        rings
+            .par_iter_mut()
+            .zip(outputs)
+            .enumerate()
+            .for_each(|(band, (ring, mut output))| {
+                let first = band * rows;
+                walk.band(first..(first + rows).min(height), ring, &mut output);
+            });
     }
 }
 
@@ -289,6 +308,13 @@ fn cut_into(isa: Isa, sums: &[u16], board: &Checkerboard, y: usize, highest: u8,
     unsafe { dispatched(isa, sums, board, y, highest, row) }
 }
 
+/// Cuts costs, `[label][index]`, to what messages can hold: each pixel's least becomes 0.
+fn saturate(isa: Isa, half_row: &mut [u8], stride: usize, highest: u8) {
+    let labels = half_row.len() / stride;
+    // SAFETY: `isa` is available; the half row has `labels` rows of `stride` bytes, a multiple of 64.
+    unsafe { saturate_half_row(isa, half_row.as_mut_ptr(), labels, stride, highest) };
+}
+
 for_each_isa! {
     unsafe fn saturate_half_row = saturate_kernel(costs: *mut u8, labels: usize, stride: usize, highest: u8)
 }
@@ -348,106 +374,68 @@ impl Level {
     }
 }
 
-/// What the rows of one level share.
+/// What a band leaves behind.
+enum Output<'a> {
+    /// Of its rows.
+    Beliefs(&'a mut [Belief]),
+    /// Its rows' messages, as [`Level::first`] of the finer level with that stride.
+    First { first: &'a mut [u8], stride: usize },
+}
+
+/// What the rows of one level share, see [`Level`].
 struct Walk<'a> {
     costs: &'a CostVolume,
     weights: &'a [u8],
-    coarser: Option<&'a Level>,
+    first: &'a [u8],
     iterations: usize,
     isa: Isa,
 }
 
-/// The rows `first..` of a level that one thread works on.
-struct Band<'a> {
-    first: usize,
-    /// As in [`Level`].
-    messages: &'a mut [u8],
-    /// Empty where no beliefs are asked.
-    beliefs: &'a mut [Belief],
-    /// Receives what is sent off the image.
-    outside: Vec<u8>,
-}
-
-/// All iterations of one level, starting from the messages of the coarser one, or from none.
-fn propagate(level: &mut Level, coarser: Option<&Level>, iterations: usize, isa: Isa, beliefs: Option<&mut [Belief]>) {
-    let Level { costs, messages, weights } = level;
-    let Checkerboard { width, height, .. } = costs.board;
-    let walk = Walk { costs, weights, coarser, iterations, isa };
-    let block = walk.block();
-    let wanted = beliefs.is_some();
-    let beliefs = beliefs.unwrap_or_default();
-    // A band must be higher than the wedges at its two borders.
-    let bands = rayon::current_num_threads().min(height / (4 * (iterations + 2))).max(1);
-    let rows = height.div_ceil(bands);
-    let belief_rows = if wanted { width * rows } else { 1 };
-    let mut beliefs_left = beliefs.chunks_mut(belief_rows);
-    let mut work: Vec<Band<'_>> = messages
-        .chunks_mut(2 * block * rows)
-        .enumerate()
-        .map(|(band, messages)| Band {
-            first: band * rows,
-            messages,
-            beliefs: beliefs_left.next().unwrap_or_default(),
-            outside: vec![0; 2 * block],
-        })
-        .collect();
-    let bands = work.len();
-    work.par_iter_mut().for_each(|band| {
-        let (first, end) = (band.first, band.first + band.messages.len() / (2 * block));
-        for front in first..end + iterations + 1 {
-            if front < end {
-                walk.start(band, front);
+impl Walk<'_> {
+    /// Iteration 0 up to the last, and then the output, each one row behind the one before.
+    fn band(&self, rows: Range<usize>, ring: &mut [AlignedBytes], output: &mut Output<'_>) {
+        let height = self.costs.board.height;
+        let start = rows.start.saturating_sub(self.iterations);
+        let end = (rows.end + self.iterations).min(height);
+        self.enter(start, ring);
+        for front in start..end + self.iterations {
+            if front + 1 < height {
+                self.enter(front + 1, ring);
             }
-            // Iteration 0 up to the last, then what is believed, each one row behind the one before.
-            for pass in 0..=iterations {
+            for pass in 0..=self.iterations {
+                // What depends on rows that this band has not done is not its own either.
+                let beyond = self.iterations - pass;
                 let Some(y) = front.checked_sub(pass) else { break };
-                let top = if first == 0 { 0 } else { first + pass + 1 };
-                let bottom = if end == height { end } else { end - pass - 1 };
-                if (top..bottom).contains(&y) {
-                    walk.pass(band, pass, y);
+                if y + beyond < rows.start || y >= (rows.end + beyond).min(height) {
+                    continue;
+                }
+                if pass < self.iterations {
+                    self.iterate(pass, y, ring);
+                } else {
+                    self.put(y, y - rows.start, &ring[y % ring.len()], output);
                 }
             }
         }
-    });
-    drop(work);
-    let mut whole = Band { first: 0, messages, beliefs, outside: vec![0; 2 * block] };
-    for border in (1..bands).map(|band| band * rows) {
-        for pass in 0..=iterations {
-            for y in border - pass - 1..border + pass + 1 {
-                walk.pass(&mut whole, pass, y);
+    }
+
+    /// A row comes into the ring: whatever is received there will be written before it is read, but for what nobody
+    /// sends across the upper and lower border.
+    fn enter(&self, y: usize, ring: &mut [AlignedBytes]) {
+        let plane = self.costs.labels * self.costs.board.stride;
+        let slot = y % ring.len();
+        for block in ring[slot].chunks_exact_mut(4 * plane) {
+            if y == 0 {
+                block[ABOVE * plane..][..plane].fill(0);
+            }
+            if y + 1 == self.costs.board.height {
+                block[BELOW * plane..][..plane].fill(0);
             }
         }
     }
-}
 
-impl Walk<'_> {
-    /// Bytes of one colour of one row of messages.
-    fn block(&self) -> usize {
-        4 * self.costs.labels * self.costs.board.stride
-    }
-
-    /// First messages of row `y`: those of the coarser level. Only what colour 0 receives is ever read, as iteration 0
-    /// rewrites what colour 1 does.
-    fn start(&self, band: &mut Band<'_>, y: usize) {
-        let block = self.block();
+    fn sender<'a>(&'a self, y: usize, colour: usize, received: &'a [u8]) -> Sender<'a> {
         let Checkerboard { half, stride, .. } = self.costs.board;
-        let to = &mut band.messages[(y - band.first) * 2 * block..][..block];
-        let Some(coarser) = self.coarser else {
-            to.fill(0);
-            return;
-        };
-        let board = coarser.costs.board;
-        let coarse_block = 4 * self.costs.labels * board.stride;
-        let row = &coarser.messages[y / 2 * 2 * coarse_block..][..2 * coarse_block];
-        let (even, odd) = row.split_at(coarse_block);
-        let (even, odd) = if Checkerboard::parity(y / 2, 0) == 0 { (even, odd) } else { (odd, even) };
-        interleave(self.isa, even, odd, board.stride, to, stride, half);
-    }
-
-    fn pass(&self, band: &mut Band<'_>, pass: usize, y: usize) {
-        let Checkerboard { width, height, half, stride } = self.costs.board;
-        let block = self.block();
-        let sender = |colour: usize, received| Sender {
+        Sender {
             labels: self.costs.labels,
             half,
             stride,
@@ -455,30 +443,46 @@ impl Walk<'_> {
             costs: self.costs.half_row(y, colour),
             received,
             weights: &self.weights[(2 * y + colour) * 8 * stride..][..8 * stride],
-        };
-        let (before, rest) = band.messages.split_at_mut((y - band.first) * 2 * block);
-        let (own, after) = rest.split_at_mut(2 * block);
-        let (colour_0, colour_1) = own.split_at_mut(block);
-        if pass == self.iterations {
-            if !band.beliefs.is_empty() {
-                let row = &mut band.beliefs[(y - band.first) * width..][..width];
-                messages::believe(self.isa, &sender(0, colour_0), width, row);
-                messages::believe(self.isa, &sender(1, colour_1), width, row);
-            }
-            return;
         }
-        let colour = pass & 1;
+    }
+
+    fn iterate(&self, iteration: usize, y: usize, ring: &mut [AlignedBytes]) {
+        let slots = ring.len();
+        // Rows outside the image have slots too, whose rows are done or not yet there: nobody reads what they get.
+        let near = [(y + slots - 1) % slots, y % slots, (y + 1) % slots];
+        let [above, own, below] = ring.get_disjoint_mut(near).expect("a ring has at least four slots");
+        let block = own.len() / 2;
+        let (colour_0, colour_1) = own.split_at_mut(block);
+        let colour = iteration & 1;
         let (received, row) = if colour == 0 { (colour_0, colour_1) } else { (colour_1, colour_0) };
-        let (outside_above, outside_below) = band.outside.split_at_mut(block);
-        let other = (1 - colour) * block;
-        let row_above = if y == 0 {
-            outside_above
+        let received = if iteration == 0 {
+            let rows = self.first.len() / block;
+            &self.first[(y / 2 % rows) * block..][..block]
         } else {
-            let row = before.len() - 2 * block;
-            &mut before[row + other..][..block]
+            &*received
         };
-        let row_below = if y + 1 == height { outside_below } else { &mut after[other..][..block] };
-        messages::send(self.isa, &sender(colour, received), row_above, row, row_below);
+        let other = (1 - colour) * block..(2 - colour) * block;
+        let (above, below) = (&mut above[other.clone()], &mut below[other]);
+        messages::send(self.isa, &self.sender(y, colour, received), above, row, below);
+    }
+
+    fn put(&self, y: usize, row: usize, messages: &[u8], output: &mut Output<'_>) {
+        let Checkerboard { width, stride, .. } = self.costs.board;
+        let (colour_0, colour_1) = messages.split_at(messages.len() / 2);
+        match output {
+            Output::Beliefs(beliefs) => {
+                let row = &mut beliefs[row * width..][..width];
+                messages::believe(self.isa, &self.sender(y, 0, colour_0), width, row);
+                messages::believe(self.isa, &self.sender(y, 1, colour_1), width, row);
+            }
+            Output::First { first, stride: finer_stride } => {
+                let bytes = 4 * self.costs.labels * *finer_stride;
+                let to = &mut first[row * bytes..][..bytes];
+                let (even, odd) =
+                    if Checkerboard::parity(y, 0) == 0 { (colour_0, colour_1) } else { (colour_1, colour_0) };
+                interleave(self.isa, even, odd, stride, to, *finer_stride, width);
+            }
+        }
     }
 }
 

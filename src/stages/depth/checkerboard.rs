@@ -100,21 +100,6 @@ impl CostVolume {
         self.labels
     }
 
-    pub fn get(&self, x: usize, y: usize, label: usize) -> u8 {
-        self.bytes[self.index(x, y, label)]
-    }
-
-    pub fn set(&mut self, x: usize, y: usize, label: usize, cost: u8) {
-        let index = self.index(x, y, label);
-        self.bytes[index] = cost;
-    }
-
-    fn index(&self, x: usize, y: usize, label: usize) -> usize {
-        let Checkerboard { width, height, stride, .. } = self.board;
-        assert!(x < width && y < height && label < self.labels);
-        ((y * 2 + ((x + y) & 1)) * self.labels + label) * stride + x / 2
-    }
-
     pub(super) fn row_bytes(&self) -> usize {
         2 * self.labels * self.board.stride
     }
@@ -123,5 +108,22 @@ impl CostVolume {
     pub(super) fn half_row(&self, y: usize, colour: usize) -> &[u8] {
         let bytes = self.labels * self.board.stride;
         &self.bytes[(y * 2 + colour) * bytes..][..bytes]
+    }
+}
+
+/// One row of a cost volume, to be filled.
+pub struct CostRow<'a> {
+    pub(super) y: usize,
+    pub(super) board: &'a Checkerboard,
+    pub(super) labels: usize,
+    /// `[colour][label][index]`
+    pub(super) bytes: &'a mut [u8],
+}
+
+impl CostRow<'_> {
+    pub fn set(&mut self, x: usize, label: usize, cost: u8) {
+        let Checkerboard { width, stride, .. } = *self.board;
+        assert!(x < width && label < self.labels);
+        self.bytes[(((x + self.y) & 1) * self.labels + label) * stride + x / 2] = cost;
     }
 }

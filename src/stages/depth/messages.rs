@@ -83,20 +83,26 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
             let costs = sender.costs.as_ptr().add(start);
             let received = sender.received.as_ptr().add(start);
             let weights = sender.weights.as_ptr().add(start);
-            let sent = sent.map(|to| to.add(start));
-            let step: [V; 4] = [0, 1, 2, 3].map(|k| V::load(weights.add(k * stride)));
-            let truncation: [V; 4] = [0, 1, 2, 3].map(|k| V::load(weights.add((4 + k) * stride)));
+            let sent = [sent[0].add(start), sent[1].add(start), sent[2].add(start), sent[3].add(start)];
+            // Plain loops: a closure would be a function of its own, without the vector instructions.
+            let mut step = [V::splat(0); 4];
+            let mut truncation = [V::splat(0); 4];
+            for k in 0..4 {
+                step[k] = V::load(weights.add(k * stride));
+                truncation[k] = V::load(weights.add((4 + k) * stride));
+            }
 
             // Lower envelope from below; the running minimum of the sums is that of the envelope.
             let mut envelope = [V::splat(255); 4];
             let mut least = [V::splat(255); 4];
             for label in 0..labels {
                 let at = label * stride;
-                let from: [V; 4] = [0, 1, 2, 3].map(|k| V::load(received.add(k * plane + at)));
+                let mut from = [V::splat(0); 4];
+                for k in 0..4 {
+                    from[k] = V::load(received.add(k * plane + at));
+                }
                 // At most 4 d + 1 + 4 d <= 249 for a truncation d <= 31.
-                let sum = V::load(costs.add(at))
-                    .add(from[0].add(from[1]))
-                    .add(from[2].add(from[3]));
+                let sum = V::load(costs.add(at)).add(from[0].add(from[1])).add(from[2].add(from[3]));
                 for k in 0..4 {
                     envelope[k] = sum.sub(from[k]).min(envelope[k].add_saturating(step[k]));
                     least[k] = least[k].min(envelope[k]);
@@ -104,8 +110,11 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
                 }
             }
             // And from above, starting at the truncation.
-            let mut envelope = [0, 1, 2, 3].map(|k| least[k].add_saturating(truncation[k]));
-            let highest = envelope;
+            let mut highest = [V::splat(0); 4];
+            for k in 0..4 {
+                highest[k] = least[k].add_saturating(truncation[k]);
+                envelope[k] = highest[k];
+            }
             for label in (0..labels).rev() {
                 let at = label * stride;
                 for k in 0..4 {

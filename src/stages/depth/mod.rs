@@ -10,12 +10,12 @@ mod plane_sweep;
 mod refine;
 
 pub use belief_propagation::{BeliefPropagation, Contrast, PropagationSettings, Smoothness};
-pub use checkerboard::CostVolume;
+pub use checkerboard::{CostRow, CostVolume};
 pub use messages::Belief;
 pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
 
 use crate::engine::isa::Isa;
-use plane_sweep::{Middle, Side};
+use plane_sweep::{Middle, Side, Sweep};
 use rayon::prelude::*;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,9 +130,10 @@ impl DepthEstimator {
             .propagation
             .get_or_insert_with(|| BeliefPropagation::new(settings.propagation, width, height, range.labels, isa));
         let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
-        plane_sweep::sweep(isa, &settings.sweep, &middle, sides, range, propagation.costs_mut());
+        let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
+        propagation.fill(settings.sweep.highest_cost(), || sweep.scratch(), |scratch, y, row| sweep.fill_row(scratch, y, row));
         find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
-        let beliefs = propagation.solve(settings.sweep.highest_cost(), &self.contrast);
+        let beliefs = propagation.solve(&self.contrast);
 
         let map = &mut self.map;
         map.label_step = range.step() as f32;

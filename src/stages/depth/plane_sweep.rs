@@ -11,7 +11,7 @@
 //! shifts along rows alone takes its samples from one table a row of eight sub-pixel phases.
 
 use super::{
-    checkerboard::{Checkerboard, CostVolume},
+    checkerboard::{Checkerboard, CostRow},
     lanes::{Lanes, for_each_isa},
 };
 use crate::{
@@ -522,65 +522,92 @@ pub(super) struct Middle<'a> {
     pub expected_depth_m: Option<&'a [f32]>,
 }
 
-/// Fills the volume. Both sides have been turned.
-pub(super) fn sweep(
+/// Everything that the rows of one frame share.
+pub(super) struct Sweep<'a> {
     isa: Isa,
-    settings: &SweepSettings,
-    middle: &Middle<'_>,
-    sides: [Option<&Side>; 2],
-    range: &InverseDepthRange,
-    volume: &mut CostVolume,
-) {
-    let board = volume.board;
-    let labels = volume.labels;
-    assert!(labels == range.labels && middle.luminance.len() == board.width * board.height);
-    let row_bytes = volume.row_bytes();
-    let samplers = sides.map(|side| Sampler::new(side, middle.intrinsics, range));
-    let strips = [0, 1].map(|side| samplers[side].strip(labels, &board));
-    volume.bytes.par_chunks_exact_mut(row_bytes).enumerate().for_each_init(
-        || (strips.clone(), [vec![0_u8; board.half + VECTOR_SLACK], vec![0_u8; board.half + VECTOR_SLACK]]),
-        |(strips, [luminance, expected]), (y, row)| {
-            for (sampler, strip) in samplers.iter().zip(strips.iter_mut()) {
-                sampler.fill(isa, y, &board, strip);
+    settings: &'a SweepSettings,
+    middle: Middle<'a>,
+    range: &'a InverseDepthRange,
+    samplers: [Sampler<'a>; 2],
+    board: Checkerboard,
+}
+
+/// What one thread fills rows with.
+pub(super) struct Scratch {
+    strips: [Strip; 2],
+    luminance: Vec<u8>,
+    expected: Vec<u8>,
+}
+
+impl<'a> Sweep<'a> {
+    /// Both sides have been turned.
+    pub fn new(
+        isa: Isa,
+        settings: &'a SweepSettings,
+        middle: Middle<'a>,
+        sides: [Option<&'a Side>; 2],
+        range: &'a InverseDepthRange,
+    ) -> Self {
+        let board = Checkerboard::new(middle.intrinsics.width, middle.intrinsics.height);
+        let samplers = sides.map(|side| Sampler::new(side, middle.intrinsics, range));
+        Self { isa, settings, middle, range, samplers, board }
+    }
+
+    pub fn scratch(&self) -> Scratch {
+        let line = vec![0; self.board.half + VECTOR_SLACK];
+        Scratch {
+            strips: [0, 1].map(|side| self.samplers[side].strip(self.range.labels, &self.board)),
+            luminance: line.clone(),
+            expected: line,
+        }
+    }
+
+    /// Costs of row `y`.
+    pub fn fill_row(&self, scratch: &mut Scratch, y: usize, row: &mut CostRow<'_>) {
+        let Self { board, range, middle, .. } = self;
+        let Scratch { strips, luminance, expected } = scratch;
+        let labels = range.labels;
+        for (sampler, strip) in self.samplers.iter().zip(strips.iter_mut()) {
+            sampler.fill(self.isa, y, board, strip);
+        }
+        let pixels = y * board.width..(y + 1) * board.width;
+        let colour_bytes = row.bytes.len() / 2;
+        for (colour, costs) in row.bytes.chunks_exact_mut(colour_bytes).enumerate() {
+            let parity = Checkerboard::parity(y, colour);
+            let here = middle.luminance[pixels.clone()].iter().skip(parity).step_by(2);
+            for (to, from) in luminance.iter_mut().zip(here) {
+                *to = *from;
             }
-            let pixels = y * board.width..(y + 1) * board.width;
-            for (colour, costs) in row.chunks_exact_mut(row_bytes / 2).enumerate() {
-                let parity = Checkerboard::parity(y, colour);
-                let here = middle.luminance[pixels.clone()].iter().skip(parity).step_by(2);
-                for (to, from) in luminance.iter_mut().zip(here) {
-                    *to = *from;
-                }
-                if let Some(depth_m) = middle.expected_depth_m {
-                    let here = depth_m[pixels.clone()].iter().skip(parity).step_by(2);
-                    for (to, depth_m) in expected.iter_mut().zip(here) {
-                        *to = if *depth_m > 0.0 {
-                            range.label_of_depth(f64::from(*depth_m)).round().clamp(0.0, labels as f64 - 1.0) as u8
-                        } else {
-                            NOT_EXPECTED
-                        };
-                    }
-                }
-                let half_row = HalfRow {
-                    luminance,
-                    expected: middle.expected_depth_m.map(|_| &expected[..]),
-                    strips,
-                    parity,
-                    board: &board,
-                };
-                half_row.check(labels, costs);
-                let isa = if board.half < 64 { isa.min(Isa::Avx2) } else { isa };
-                // SAFETY: `isa` is available; `check` has found all slices long enough for vectors that start below
-                // `half`, and no vector is longer than a half row or 32.
-                unsafe { cost_half_row(isa, settings, &half_row, labels, costs) };
-                // Outside the image there is nothing to cost; coarser levels sum these too.
-                if 2 * (board.half - 1) + parity >= board.width {
-                    for costs in costs.chunks_exact_mut(board.stride) {
-                        costs[board.half - 1] = 0;
-                    }
+            if let Some(depth_m) = middle.expected_depth_m {
+                let here = depth_m[pixels.clone()].iter().skip(parity).step_by(2);
+                for (to, depth_m) in expected.iter_mut().zip(here) {
+                    *to = if *depth_m > 0.0 {
+                        range.label_of_depth(f64::from(*depth_m)).round().clamp(0.0, labels as f64 - 1.0) as u8
+                    } else {
+                        NOT_EXPECTED
+                    };
                 }
             }
-        },
-    );
+            let half_row = HalfRow {
+                luminance,
+                expected: middle.expected_depth_m.map(|_| &expected[..]),
+                strips,
+                parity,
+                board,
+            };
+            half_row.check(labels, costs);
+            let isa = if board.half < 64 { self.isa.min(Isa::Avx2) } else { self.isa };
+            // SAFETY: `isa` is available; `check` has found all slices long enough for vectors that start below
+            // `half`, and no vector is longer than a half row or 32.
+            unsafe { cost_half_row(isa, self.settings, &half_row, labels, costs) };
+            // Outside the image there is nothing to cost; coarser levels sum these too.
+            if 2 * (board.half - 1) + parity >= board.width {
+                for costs in costs.chunks_exact_mut(board.stride) {
+                    costs[board.half - 1] = 0;
+                }
+            }
+        }
+    }
 }
 
 /// Label that stands for an unknown depth; a range of 256 labels loses its nearest as an expectation.
@@ -625,15 +652,19 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
         for start in Checkerboard::vector_starts(half, V::N) {
             let luminance = V::load(row.luminance.as_ptr().add(start));
             for label in 0..labels {
-                let side = |strip: &Strip| {
+                // Plain loops: a closure would be a function of its own, without the vector instructions.
+                let mut differences = [most; 2];
+                let mut votes = [most; 2];
+                for side in 0..2 {
+                    let strip = &row.strips[side];
                     let at = strip.at.get_unchecked(label)[row.parity] + start;
                     let low = V::load(strip.low.as_ptr().add(at));
                     let high = V::load(strip.high.as_ptr().add(at));
                     let difference = luminance.sub_saturating(high).max(low.sub_saturating(luminance));
-                    (difference.min(most), V::load(strip.inside.as_ptr().add(at)))
-                };
-                let (left, left_votes) = side(&row.strips[0]);
-                let (right, right_votes) = side(&row.strips[1]);
+                    differences[side] = difference.min(most);
+                    votes[side] = V::load(strip.inside.as_ptr().add(at));
+                }
+                let ([left, right], [left_votes, right_votes]) = (differences, votes);
                 let l = left.replace_where_less(left_votes, one, right);
                 let r = right.replace_where_less(right_votes, one, left);
                 let mut cost = l.average(r).min(l.min(r).add(occlusion));
