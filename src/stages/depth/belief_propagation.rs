@@ -179,7 +179,7 @@ impl BeliefPropagation {
                         let (sum, rest) = sums[depth..].split_at_mut(1);
                         cut_into(isa, &sum[0], &boards[depth], y, highest, row);
                         if let Some(next) = rest.first_mut() {
-                            sum_pairs(&sum[0], boards[depth].width, next, boards[depth + 1].width, y % 2 == 0);
+                            sum_pairs(isa, &sum[0], boards[depth].width, next, boards[depth + 1].width, y % 2 == 0);
                         }
                     }
                 }
@@ -253,15 +253,27 @@ fn sum_into(isa: Isa, sums: &mut [u16], width: usize, a: &[u8], b: &[u8], stride
 }
 
 /// Adds pairs of pixels of one row to the row of the next level.
-fn sum_pairs(sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool) {
-    for (sums, next) in sums.chunks_exact(width).zip(next.chunks_exact_mut(next_width)) {
-        if first {
-            next.fill(0);
-        }
-        for (pair, next) in sums.chunks(2).zip(next) {
-            *next += pair.iter().sum::<u16>();
+fn sum_pairs(isa: Isa, sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool) {
+    #[inline(always)]
+    fn run<V: Lanes>(sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool) {
+        for (sums, next) in sums.chunks_exact(width).zip(next.chunks_exact_mut(next_width)) {
+            let (pairs, rest) = sums.as_chunks::<2>();
+            if first {
+                next.fill(0);
+            }
+            for (pair, next) in pairs.iter().zip(&mut *next) {
+                *next += pair[0] + pair[1];
+            }
+            if let [last] = rest {
+                next[pairs.len()] += last;
+            }
         }
     }
+    for_each_isa! {
+        unsafe fn dispatched = run(sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool)
+    }
+    // SAFETY: `isa` is available; the kernel is safe code.
+    unsafe { dispatched(isa, sums, width, next, next_width, first) }
 }
 
 /// Stores sums of costs, `[label][x]`, as row `y` of a level: each pixel's least becomes 0, what exceeds `highest` is
@@ -342,35 +354,38 @@ impl Level {
     /// Writes the weights of all edges; without contrast all are smooth.
     fn weigh(&mut self, settings: &PropagationSettings, contrast: Option<&Contrast>) {
         let Checkerboard { width, height, stride, half } = self.costs.board;
-        if let Some(contrast) = contrast {
-            assert!(contrast.right.len() == width * height && contrast.below.len() == width * height);
+        if let Some(Contrast { right, below }) = contrast {
+            assert!(right.len() == width * height && below.len() == width * height, "one contrast a pixel");
         }
         let PropagationSettings { smooth, across_contrast, .. } = *settings;
-        let class = |differ: Option<u8>| match differ {
-            None => Smoothness { step: 0, truncation: 0 },
-            Some(0) => smooth,
-            Some(_) => across_contrast,
-        };
-        let right = |x: usize, y: usize| (x + 1 < width).then(|| contrast.map_or(0, |c| c.right[y * width + x]));
-        let below = |x: usize, y: usize| (y + 1 < height).then(|| contrast.map_or(0, |c| c.below[y * width + x]));
-        for (row, weights) in self.weights.chunks_exact_mut(8 * stride).enumerate() {
-            let (y, colour) = (row / 2, row % 2);
-            for i in 0..half {
-                let x = 2 * i + Checkerboard::parity(y, colour);
-                if x >= width {
-                    continue;
+        let alike = vec![0; width];
+        self.weights.par_chunks_exact_mut(16 * stride).enumerate().for_each(|(y, weights)| {
+            let row = |differs: fn(&Contrast) -> &[u8], y: usize| {
+                contrast.map_or(&alike[..], |contrast| &differs(contrast)[y * width..][..width])
+            };
+            let right = row(|contrast| &contrast.right, y);
+            let below = row(|contrast| &contrast.below, y);
+            let above = row(|contrast| &contrast.below, y.saturating_sub(1));
+            for (colour, weights) in weights.chunks_exact_mut(8 * stride).enumerate() {
+                let parity = Checkerboard::parity(y, colour);
+                let own = |row: &[u8], i: usize| row.get(2 * i + parity).copied();
+                for i in 0..half {
+                    let mut put = |neighbour: usize, differs: Option<u8>| {
+                        let Smoothness { step, truncation } = match differs {
+                            None => Smoothness { step: 0, truncation: 0 },
+                            Some(0) => smooth,
+                            Some(_) => across_contrast,
+                        };
+                        weights[neighbour * stride + i] = step;
+                        weights[(4 + neighbour) * stride + i] = truncation;
+                    };
+                    put(RIGHT, own(&right[..width - 1], i));
+                    put(LEFT, (2 * i + parity).checked_sub(1).and_then(|x| right[..width - 1].get(x).copied()));
+                    put(BELOW, if y + 1 < height { own(below, i) } else { None });
+                    put(ABOVE, if y > 0 { own(above, i) } else { None });
                 }
-                let mut put = |neighbour: usize, differ: Option<u8>| {
-                    let Smoothness { step, truncation } = class(differ);
-                    weights[neighbour * stride + i] = step;
-                    weights[(4 + neighbour) * stride + i] = truncation;
-                };
-                put(RIGHT, right(x, y));
-                put(BELOW, below(x, y));
-                put(LEFT, if x > 0 { right(x - 1, y) } else { None });
-                put(ABOVE, if y > 0 { below(x, y - 1) } else { None });
             }
-        }
+        });
     }
 }
 

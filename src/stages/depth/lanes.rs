@@ -12,6 +12,8 @@ pub unsafe trait Lanes: Copy {
     const N: usize;
 
     unsafe fn splat(value: u8) -> Self;
+    /// Asks for the cache line at any address, which need not be valid.
+    unsafe fn prefetch(at: *const u8);
     /// # Safety
     /// `N` readable bytes at `from`; no alignment asked.
     unsafe fn load(from: *const u8) -> Self;
@@ -51,6 +53,8 @@ unsafe impl Lanes for PortableLanes {
     unsafe fn splat(value: u8) -> Self {
         Self([value; 16])
     }
+    #[inline(always)]
+    unsafe fn prefetch(_at: *const u8) {}
     #[inline(always)]
     unsafe fn load(from: *const u8) -> Self {
         // SAFETY: the caller grants N readable bytes; an array of bytes needs no alignment.
@@ -128,6 +132,10 @@ mod x86 {
                 #[inline(always)]
                 unsafe fn splat(value: u8) -> Self {
                     unsafe { Self($splat(value.cast_signed())) }
+                }
+                #[inline(always)]
+                unsafe fn prefetch(at: *const u8) {
+                    unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) }
                 }
                 #[inline(always)]
                 unsafe fn load(from: *const u8) -> Self {

@@ -274,16 +274,18 @@ struct Strip {
     low: Vec<u8>,
     high: Vec<u8>,
     inside: Vec<u8>,
-    /// `[label][parity]`: first sample of the half row.
+    /// `[label][parity]`: first sample of the half row, in `low` and `high` and in `inside`.
     at: Vec<[usize; 2]>,
-    phases: Vec<u8>,
+    inside_at: Vec<[usize; 2]>,
+    scratch: Vec<u8>,
 }
 
 impl Strip {
     /// One that never has a vote.
     fn blind(labels: usize, half: usize) -> Self {
         let none = vec![0; half + VECTOR_SLACK];
-        Self { low: none.clone(), high: none.clone(), inside: none, at: vec![[0; 2]; labels], phases: Vec::new() }
+        let at = vec![[0; 2]; labels];
+        Self { low: none.clone(), high: none.clone(), inside: none, inside_at: at.clone(), at, scratch: Vec::new() }
     }
 }
 
@@ -323,31 +325,40 @@ impl<'a> Sampler<'a> {
             Self::Blind => Strip::blind(labels, board.half),
             Self::Rows { side, eighths, .. } => {
                 let line = side.width.div_ceil(2) + VECTOR_SLACK;
-                let at = eighths.iter().map(|eighths| {
+                // First pixel and phase of a label, and of its half rows.
+                let place = |eighths: &isize, parity: usize| {
                     let (pixels, phase) = (eighths.div_euclid(PHASES as isize), eighths.rem_euclid(PHASES as isize));
-                    let first = (side.margin as isize + pixels) as usize;
-                    [0, 1].map(|parity| {
-                        let x = first + parity;
-                        (phase as usize * 2 + x % 2) * line + x / 2
-                    })
-                });
-                let bytes = PHASES * 2 * line;
+                    let x = (side.margin as isize + pixels) as usize + parity;
+                    (x, phase as usize)
+                };
+                let at = |eighths: &isize, parity: usize| {
+                    let (x, phase) = place(eighths, parity);
+                    (x % 2 * PHASES + phase) * line + x / 2
+                };
+                let inside_at = |eighths: &isize, parity: usize| {
+                    let (x, phase) = place(eighths, parity);
+                    (x % 2 * 2 + phase.min(1)) * line + x / 2
+                };
                 Strip {
-                    low: vec![0; bytes],
-                    high: vec![0; bytes],
-                    inside: vec![0; bytes],
-                    at: at.collect(),
-                    phases: vec![0; PHASES * (side.width + 2)],
+                    low: vec![0; 2 * PHASES * line],
+                    high: vec![0; 2 * PHASES * line],
+                    inside: vec![0; 4 * line],
+                    at: eighths.iter().map(|eighths| [at(eighths, 0), at(eighths, 1)]).collect(),
+                    inside_at: eighths.iter().map(|eighths| [inside_at(eighths, 0), inside_at(eighths, 1)]).collect(),
+                    scratch: vec![0; (2 * PHASES + 4) * line],
                 }
             }
             Self::Free { side, motions } => {
                 let line = board.half + VECTOR_SLACK;
+                let at: Vec<_> =
+                    (0..labels).map(|label| [0, 1].map(|parity| (label * 2 + parity) * line)).collect();
                 Strip {
                     low: vec![0; labels * 2 * line],
                     high: vec![0; labels * 2 * line],
                     inside: vec![0; labels * 2 * line],
-                    at: (0..labels).map(|label| [0, 1].map(|parity| (label * 2 + parity) * line)).collect(),
-                    phases: vec![0; 2 * (side.width + 2) + 2 * motions.len() * (board.width + 1)],
+                    inside_at: at.clone(),
+                    at,
+                    scratch: vec![0; 2 * (side.width + 2) + 2 * motions.len() * (board.width + 1)],
                 }
             }
         }
@@ -372,65 +383,80 @@ for_each_isa! {
     unsafe fn fill_phases = fill_phases_kernel(row: &[u8], inside: &[u8], radius: isize, strip: &mut Strip)
 }
 
-/// The row at eight sub-pixel phases, each even and odd pixels apart, with the interval to `radius` eighths around.
+/// The row at eight sub-pixel phases, even and odd pixels apart, with the interval to `radius` eighths around. Sample `i`
+/// of phase `q` in 0..16 stands at pixel `2 i + q / 8`.
 #[inline(always)]
 fn fill_phases_kernel<V: Lanes>(row: &[u8], inside: &[u8], radius: isize, strip: &mut Strip) {
-    let width = row.len();
-    let line = width.div_ceil(2) + VECTOR_SLACK;
-    let pitch = width + 2;
-    let Strip { low, high, inside: votes, phases, .. } = strip;
-    for (phase, to) in phases.chunks_exact_mut(pitch).enumerate() {
+    let line = row.len().div_ceil(2) + VECTOR_SLACK;
+    let n = row.len().div_ceil(2);
+    let Strip { low, high, inside: votes, scratch, .. } = strip;
+    let (phases, pixels) = scratch.split_at_mut(2 * PHASES * line);
+    let (row_even, rest) = pixels.split_at_mut(line);
+    let (row_odd, rest) = rest.split_at_mut(line);
+    let (inside_even, inside_odd) = rest.split_at_mut(line);
+    part(row, row_even, row_odd);
+    part(inside, inside_even, inside_odd);
+    // One sample of margin at the front, for intervals that begin before the row, and one at the end.
+    for phase in 0..PHASES {
         let (w1, w0) = (phase as u16, (PHASES - phase) as u16);
-        // One pixel of margin at the front, for intervals that begin before the row.
-        to[0] = row[0];
-        to[width + 1] = row[width - 1];
-        to[width] = row[width - 1];
-        for ((to, a), b) in to[1..width].iter_mut().zip(row).zip(&row[1..]) {
-            *to = ((u16::from(*a) * w0 + u16::from(*b) * w1 + PHASES as u16 / 2) / PHASES as u16) as u8;
+        let half = PHASES as u16 / 2;
+        let even = &mut phases[phase * line..][..n + 2];
+        for i in 0..n {
+            even[1 + i] = ((u16::from(row_even[i]) * w0 + u16::from(row_odd[i]) * w1 + half) / PHASES as u16) as u8;
+        }
+        (even[0], even[n + 1]) = (even[1], even[n]);
+        let odd = &mut phases[(PHASES + phase) * line..][..n + 2];
+        for i in 0..n {
+            odd[1 + i] = ((u16::from(row_odd[i]) * w0 + u16::from(row_even[i + 1]) * w1 + half) / PHASES as u16) as u8;
+        }
+        (odd[0], odd[n + 1]) = (odd[1], odd[n]);
+    }
+    for q in 0..2 * PHASES {
+        let begin = |eighths: isize| {
+            let at = q as isize + eighths;
+            let (pairs, q) = (at.div_euclid(2 * PHASES as isize), at.rem_euclid(2 * PHASES as isize) as usize);
+            q * line + (1 + pairs) as usize
+        };
+        let before = &phases[begin(-radius)..][..n];
+        let here = &phases[begin(0)..][..n];
+        let after = &phases[begin(radius)..][..n];
+        let low = &mut low[q * line..][..n];
+        for i in 0..n {
+            low[i] = before[i].min(here[i]).min(after[i]);
+        }
+        let high = &mut high[q * line..][..n];
+        for i in 0..n {
+            high[i] = before[i].max(here[i]).max(after[i]);
         }
     }
-    for phase in 0..PHASES {
-        let shifted = |eighths: isize| {
-            let at = phase as isize + eighths;
-            let (pixels, phase) = (at.div_euclid(PHASES as isize), at.rem_euclid(PHASES as isize) as usize);
-            &phases[phase * pitch + (1 + pixels) as usize..][..width]
-        };
-        let (before, here, after) = (shifted(-radius), shifted(0), shifted(radius));
-        let (even_low, odd_low) = low[phase * 2 * line..][..2 * line].split_at_mut(line);
-        let (even_high, odd_high) = high[phase * 2 * line..][..2 * line].split_at_mut(line);
-        let (even_votes, odd_votes) = votes[phase * 2 * line..][..2 * line].split_at_mut(line);
-        let pairs = before
-            .as_chunks::<2>()
-            .0
-            .iter()
-            .zip(here.as_chunks::<2>().0)
-            .zip(after.as_chunks::<2>().0);
-        for (i, ((before, here), after)) in pairs.enumerate() {
-            even_low[i] = before[0].min(here[0]).min(after[0]);
-            odd_low[i] = before[1].min(here[1]).min(after[1]);
-            even_high[i] = before[0].max(here[0]).max(after[0]);
-            odd_high[i] = before[1].max(here[1]).max(after[1]);
-        }
-        // A sample between two pixels needs both.
-        let next = usize::from(phase > 0);
-        let vote = |x: usize| inside[x] & inside[(x + next).min(width - 1)];
-        for i in 0..width / 2 {
-            even_votes[i] = vote(2 * i);
-            odd_votes[i] = vote(2 * i + 1);
-        }
-        if width % 2 == 1 {
-            let (i, x) = (width / 2, width - 1);
-            even_low[i] = before[x].min(here[x]).min(after[x]);
-            even_high[i] = before[x].max(here[x]).max(after[x]);
-            even_votes[i] = vote(x);
-        }
+    // A sample between two pixels needs both.
+    for i in 0..n {
+        votes[i] = inside_even[i];
+        votes[line + i] = inside_even[i] & inside_odd[i];
+        votes[2 * line + i] = inside_odd[i];
+        votes[3 * line + i] = inside_odd[i] & inside_even[i + 1];
+    }
+}
+
+/// Even and odd pixels of a row; the one beyond its end is as its last.
+#[inline(always)]
+fn part(row: &[u8], even: &mut [u8], odd: &mut [u8]) {
+    let (pairs, rest) = row.as_chunks::<2>();
+    for (i, pair) in pairs.iter().enumerate() {
+        even[i] = pair[0];
+        odd[i] = pair[1];
+    }
+    let last = row[row.len() - 1];
+    even[pairs.len()] = last;
+    if !rest.is_empty() {
+        odd[pairs.len()] = last;
     }
 }
 
 /// Every label's row sampled by itself, where a hypothesis also shifts rows or scales.
 fn fill_free(isa: Isa, side: &Side, motions: &[(f64, f64, f64)], y: usize, board: &Checkerboard, strip: &mut Strip) {
-    let Strip { low, high, inside, at, phases } = strip;
-    let (scratch, samples) = phases.split_at_mut(2 * (side.width + 2));
+    let Strip { low, high, inside, at, scratch, .. } = strip;
+    let (scratch, samples) = scratch.split_at_mut(2 * (side.width + 2));
     let (values, votes) = samples.split_at_mut(motions.len() * (board.width + 1));
     let rows = values.chunks_exact_mut(board.width + 1).zip(votes.chunks_exact_mut(board.width + 1));
     for ((scale, x0, y0), (values, votes)) in motions.iter().zip(rows) {
@@ -627,9 +653,10 @@ impl HalfRow<'_> {
         assert!(self.luminance.len() >= reach && costs.len() >= labels * self.board.stride);
         assert!(self.expected.is_none_or(|expected| expected.len() >= reach));
         for strip in self.strips {
-            let end = strip.at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
-            assert!(strip.at.len() == labels);
-            assert!(strip.low.len() >= end && strip.high.len() >= end && strip.inside.len() >= end);
+            let end = |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
+            assert!(strip.at.len() == labels && strip.inside_at.len() == labels);
+            assert!(strip.low.len().min(strip.high.len()) >= end(&strip.at));
+            assert!(strip.inside.len() >= end(&strip.inside_at));
         }
     }
 }
@@ -662,7 +689,8 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
                     let high = V::load(strip.high.as_ptr().add(at));
                     let difference = luminance.sub_saturating(high).max(low.sub_saturating(luminance));
                     differences[side] = difference.min(most);
-                    votes[side] = V::load(strip.inside.as_ptr().add(at));
+                    let inside_at = strip.inside_at.get_unchecked(label)[row.parity] + start;
+                    votes[side] = V::load(strip.inside.as_ptr().add(inside_at));
                 }
                 let ([left, right], [left_votes, right_votes]) = (differences, votes);
                 let l = left.replace_where_less(left_votes, one, right);
@@ -711,24 +739,45 @@ pub(super) fn match_exposure(middle: &[u8], side: &[u8]) -> [u8; 256] {
     std::array::from_fn(|value| (gain * value as f64 + offset).round().clamp(0.0, 255.0) as u8)
 }
 
+/// Where a side sees the middle's pixels at one hypothesis, in its turned image.
+#[derive(Clone, Copy)]
+pub(super) struct Placing {
+    scale: f32,
+    x: f32,
+    y: f32,
+}
+
+impl Placing {
+    /// Index in [`Side::inside`]; `None` outside the canvas.
+    pub fn of(&self, side: &Side, x: usize, y: usize) -> Option<usize> {
+        // Rounds, as what is added contains a half; what is negative is not in 0.. as an integer either.
+        let u = (x as f32 * self.scale + self.x) as i32;
+        let v = (y as f32 * self.scale + self.y) as i32;
+        let at = v as usize * side.width + u as usize;
+        (u >= 0 && v >= 0 && u < side.width as i32 && at < side.inside.len()).then_some(at)
+    }
+}
+
 impl Side {
-    /// Where the side sees the middle's pixel `(x, y)` at inverse depth `rho`, in the turned image; whether an image is
-    /// there, and where in an array of its canvas.
-    pub fn canvas_index(&self, (scale, x0, y0): (f64, f64, f64), x: usize, y: usize) -> Option<usize> {
-        let u = (x as f64 * scale + x0 + self.margin as f64 + 0.5).floor();
-        let v = (y as f64 * scale + y0 + self.margin_rows as f64 + 0.5).floor();
-        if u < 0.0 || v < 0.0 || u >= self.width as f64 {
-            return None;
+    pub fn placing(&self, inverse_depth: f64) -> Placing {
+        let (scale, x, y) = self.motion.at(inverse_depth);
+        Placing {
+            scale: scale as f32,
+            x: (x + self.margin as f64 + 0.5) as f32,
+            y: (y + self.margin_rows as f64 + 0.5) as f32,
         }
-        let at = v as usize * self.width + u as usize;
-        (self.inside.get(at) == Some(&255)).then_some(at)
     }
 
-    pub fn canvas_pixels(&self) -> usize {
-        self.inside.len()
+    /// How many labels move the middle of the image by a pixel; not more than there are.
+    pub fn labels_per_pixel(&self, range: &InverseDepthRange) -> f64 {
+        let (far, near) = (self.motion.at(range.far), self.motion.at(range.near));
+        let centre = |(scale, x, y): (f64, f64, f64)| (scale * self.motion.cx + x, scale * self.motion.cy + y);
+        let ((x0, y0), (x1, y1)) = (centre(far), centre(near));
+        range.labels as f64 / (x1 - x0).hypot(y1 - y0).max(1.0)
     }
 
-    pub fn motion_at(&self, inverse_depth: f64) -> (f64, f64, f64) {
-        self.motion.at(inverse_depth)
+    /// 255 where the side has an image, row by row of its canvas.
+    pub fn inside(&self) -> &[u8] {
+        &self.inside
     }
 }

@@ -57,27 +57,24 @@ pub(super) fn mark_seen(
     seen_by: &mut [u8],
 ) {
     nearest.clear();
-    nearest.resize(side.canvas_pixels(), 0);
-    let motions: Vec<_> = (0..range.labels)
-        .map(|label| side.motion_at(range.inverse_depth(label as f64)))
-        .collect();
-    let place = |index: usize| {
-        let motion = motions[usize::from(beliefs[index].label)];
-        side.canvas_index(motion, index % width, index / width)
-    };
-    for (index, belief) in beliefs.iter().enumerate() {
-        if let Some(at) = place(index) {
-            nearest[at] = nearest[at].max(belief.label);
+    nearest.resize(side.inside().len(), 0);
+    let placings: Vec<_> = (0..range.labels).map(|label| side.placing(range.inverse_depth(label as f64))).collect();
+    // A slanted surface puts neighbours that lie up to a pixel apart in one place.
+    let labels_per_pixel = side.labels_per_pixel(range).ceil() as u8;
+    let rows = || beliefs.chunks_exact(width).enumerate();
+    for (y, row) in rows() {
+        for (x, belief) in row.iter().enumerate() {
+            if let Some(at) = placings[usize::from(belief.label)].of(side, x, y) {
+                nearest[at] = nearest[at].max(belief.label);
+            }
         }
     }
-    // A slanted surface puts neighbours that lie up to a pixel apart in one place.
-    let shift = (motions[range.labels - 1].1 - motions[0].1).abs().max((motions[range.labels - 1].2 - motions[0].2).abs());
-    let labels_per_pixel = (range.labels as f64 / shift.max(1.0)).ceil() as u8;
-    for (index, belief) in beliefs.iter().enumerate() {
-        if let Some(at) = place(index)
-            && nearest[at] <= belief.label.saturating_add(labels_per_pixel + 1)
-        {
-            seen_by[index] |= bit;
+    for ((y, row), seen_by) in rows().zip(seen_by.chunks_exact_mut(width)) {
+        for ((x, belief), seen_by) in row.iter().enumerate().zip(seen_by) {
+            if let Some(at) = placings[usize::from(belief.label)].of(side, x, y) {
+                let clear = nearest[at] <= belief.label.saturating_add(labels_per_pixel.saturating_add(1));
+                *seen_by |= if clear { bit & side.inside()[at] } else { 0 };
+            }
         }
     }
 }
