@@ -29,14 +29,14 @@ pub struct DepthSettings {
 impl Default for DepthSettings {
     fn default() -> Self {
         Self {
-            sweep: SweepSettings { most_difference: 15, occlusion: 3, most_surprise: 2 },
+            sweep: SweepSettings { most_difference: 19, occlusion: 6, most_surprise: 2, unseen: 9 },
             propagation: PropagationSettings {
-                smooth: Smoothness { step: 3, truncation: 20 },
-                across_contrast: Smoothness { step: 2, truncation: 10 },
+                smooth: Smoothness { step: 4, truncation: 13 },
+                across_contrast: Smoothness { step: 3, truncation: 4 },
                 levels: 5,
                 iterations: 5,
             },
-            contrast: 8,
+            contrast: 12,
         }
     }
 }
@@ -69,7 +69,6 @@ pub struct DepthEstimator {
     sides: [Side; 2],
     contrast: Contrast,
     along_rows: Vec<f32>,
-    nearest: Vec<u8>,
     map: DepthMap,
 }
 
@@ -88,7 +87,6 @@ impl DepthEstimator {
             sides: Default::default(),
             contrast: Contrast::default(),
             along_rows: Vec::new(),
-            nearest: Vec::new(),
             map: DepthMap::default(),
         }
     }
@@ -117,9 +115,6 @@ impl DepthEstimator {
                 side.turn(&rig.middle, &camera, range, &exposure, luminance);
             }
         }
-        let [left, right] = &self.sides;
-        let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
-
         let size = (width, height, range.labels);
         if self.size != size {
             self.propagation = None;
@@ -129,10 +124,29 @@ impl DepthEstimator {
         let propagation = self
             .propagation
             .get_or_insert_with(|| BeliefPropagation::new(settings.propagation, width, height, range.labels, isa));
-        let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
-        let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
-        propagation.fill(settings.sweep.highest_cost(), || sweep.scratch(), |scratch, y, row| sweep.fill_row(scratch, y, row));
         find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
+        // First what is in front at half the resolution, then with each side's vote only where that leaves it a view.
+        for visible in [false, true] {
+            if visible {
+                let (guess, half) = if std::env::var("FULL").is_ok() { (propagation.solve(&self.contrast), width) } else { propagation.guess() };
+                let scale = width.div_ceil(half);
+                for side in &mut self.sides {
+                    side.block(range, height, |y| {
+                        let row = &guess[y / scale * half..][..half];
+                        row.iter().flat_map(move |belief| std::iter::repeat_n(belief.label, scale)).take(width)
+                    });
+                }
+            }
+            let [left, right] = &self.sides;
+            let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
+            let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
+            let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
+            propagation.fill(
+                settings.sweep.highest_cost(),
+                || sweep.scratch(),
+                |scratch, y, row| sweep.fill_row(scratch, y, row),
+            );
+        }
         let beliefs = propagation.solve(&self.contrast);
 
         let map = &mut self.map;
@@ -142,9 +156,12 @@ impl DepthEstimator {
         refine::refine(beliefs, width, &mut self.along_rows, &mut map.inverse_depth);
         map.seen_by.clear();
         map.seen_by.resize(pixels, 0);
-        for (side, bit) in sides.iter().zip([SEEN_BY_LEFT, SEEN_BY_RIGHT]) {
-            if let Some(side) = side {
-                refine::mark_seen(side, range, beliefs, width, bit, &mut self.nearest, &mut map.seen_by);
+        let bits = [(rig.left, SEEN_BY_LEFT), (rig.right, SEEN_BY_RIGHT)];
+        for (side, (camera, bit)) in self.sides.iter_mut().zip(bits) {
+            if camera.is_some() {
+                let labels_of = |y: usize| beliefs[y * width..][..width].iter().map(|belief| belief.label);
+                side.block(range, height, labels_of);
+                side.mark_seen(range, height, beliefs, bit, &mut map.seen_by);
             }
         }
         map.depth_m.resize(pixels, 0.0);

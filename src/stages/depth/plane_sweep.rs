@@ -13,6 +13,7 @@
 use super::{
     checkerboard::{Checkerboard, CostRow},
     lanes::{Lanes, for_each_isa},
+    messages::Belief,
 };
 use crate::{
     engine::isa::Isa,
@@ -47,10 +48,10 @@ pub struct InverseDepthRange {
 }
 
 impl InverseDepthRange {
-    /// `None` unless 0 <= far < near, both finite, and 2 <= labels <= 256.
+    /// `None` unless 0 <= far < near, both finite, and 2 <= labels <= 255.
     pub fn new(far: f64, near: f64, labels: usize) -> Option<Self> {
         let ordered = far >= 0.0 && near > far && near.is_finite();
-        (ordered && (2..=256).contains(&labels)).then_some(Self { far, near, labels })
+        (ordered && (2..=255).contains(&labels)).then_some(Self { far, near, labels })
     }
 
     /// 1/m from one label to the next.
@@ -78,6 +79,8 @@ pub struct SweepSettings {
     /// The most that a label far from the expected depth costs, grey levels: far less than `most_difference`, so that
     /// it decides where the images do not, and never against them.
     pub most_surprise: u8,
+    /// What a label costs that neither side could see, grey levels.
+    pub unseen: u8,
 }
 
 impl SweepSettings {
@@ -86,6 +89,9 @@ impl SweepSettings {
         self.most_difference.saturating_add(self.most_surprise)
     }
 }
+
+/// Blocks the view of every label: beyond the image.
+const OUTSIDE: u8 = 255;
 
 /// Sub-pixel phases of the tables.
 const PHASES: usize = 8;
@@ -105,8 +111,10 @@ pub(super) struct Side {
     margin: usize,
     margin_rows: usize,
     luminance: Vec<u8>,
-    /// 255 where there is an image, else 0.
-    inside: Vec<u8>,
+    /// [`OUTSIDE`] where there is no image, else 0.
+    outside: Vec<u8>,
+    /// The least label that is seen there past what is known to stand in front: `outside`, and nearest labels.
+    blocker: Vec<u8>,
     motion: Motion,
 }
 
@@ -189,27 +197,29 @@ impl Side {
             self.seen = seen;
             (self.width, self.margin, self.margin_rows) = (width, margin, margin_rows);
             self.luminance = vec![0; width * height];
-            self.inside = vec![0; width * height];
+            self.outside = vec![OUTSIDE; width * height];
             let same_lens = side.intrinsics == *middle;
             self.look_up = if same_lens && side.side_from_middle.rotation.angle() * middle.fx < 1.0 / 64.0 {
                 Vec::new()
             } else {
                 look_up(middle, side, width, height, margin, margin_rows)
             };
-            for (inside, look_up) in self.inside.iter_mut().zip(&self.look_up) {
-                *inside = if look_up.index == u32::MAX { 0 } else { 255 };
+            for (outside, look_up) in self.outside.iter_mut().zip(&self.look_up) {
+                *outside = if look_up.index == u32::MAX { OUTSIDE } else { 0 };
             }
         }
         if self.look_up.is_empty() {
             for (y, row) in luminance.chunks_exact(middle.width).enumerate() {
                 let at = (y + margin_rows) * width + margin;
-                self.inside[at..at + middle.width].fill(255);
+                self.outside[at..at + middle.width].fill(0);
                 for (to, from) in self.luminance[at..at + middle.width].iter_mut().zip(row) {
                     *to = exposure[usize::from(*from)];
                 }
             }
+            self.blocker.clone_from(&self.outside);
             return;
         }
+        self.blocker.clone_from(&self.outside);
         let stride = side.intrinsics.width;
         self.luminance
             .par_chunks_exact_mut(width)
@@ -270,13 +280,13 @@ fn look_up(
 /// Samples of one side for one row: where each label's are.
 #[derive(Default, Clone)]
 struct Strip {
-    /// Least, greatest luminance of each sample's interval, and whether it is inside the image.
+    /// Least, greatest luminance of each sample's interval, and what blocks its view.
     low: Vec<u8>,
     high: Vec<u8>,
-    inside: Vec<u8>,
-    /// `[label][parity]`: first sample of the half row, in `low` and `high` and in `inside`.
+    blocker: Vec<u8>,
+    /// `[label][parity]`: first sample of the half row, in `low` and `high` and in `blocker`.
     at: Vec<[usize; 2]>,
-    inside_at: Vec<[usize; 2]>,
+    blocker_at: Vec<[usize; 2]>,
     scratch: Vec<u8>,
 }
 
@@ -285,7 +295,7 @@ impl Strip {
     fn blind(labels: usize, half: usize) -> Self {
         let none = vec![0; half + VECTOR_SLACK];
         let at = vec![[0; 2]; labels];
-        Self { low: none.clone(), high: none.clone(), inside: none, inside_at: at.clone(), at, scratch: Vec::new() }
+        Self { low: none.clone(), high: none, blocker: vec![OUTSIDE; half + VECTOR_SLACK], blocker_at: at.clone(), at, scratch: Vec::new() }
     }
 }
 
@@ -335,16 +345,16 @@ impl<'a> Sampler<'a> {
                     let (x, phase) = place(eighths, parity);
                     (x % 2 * PHASES + phase) * line + x / 2
                 };
-                let inside_at = |eighths: &isize, parity: usize| {
+                let blocker_at = |eighths: &isize, parity: usize| {
                     let (x, phase) = place(eighths, parity);
                     (x % 2 * 2 + phase.min(1)) * line + x / 2
                 };
                 Strip {
                     low: vec![0; 2 * PHASES * line],
                     high: vec![0; 2 * PHASES * line],
-                    inside: vec![0; 4 * line],
+                    blocker: vec![OUTSIDE; 4 * line],
                     at: eighths.iter().map(|eighths| [at(eighths, 0), at(eighths, 1)]).collect(),
-                    inside_at: eighths.iter().map(|eighths| [inside_at(eighths, 0), inside_at(eighths, 1)]).collect(),
+                    blocker_at: eighths.iter().map(|eighths| [blocker_at(eighths, 0), blocker_at(eighths, 1)]).collect(),
                     scratch: vec![0; (2 * PHASES + 4) * line],
                 }
             }
@@ -355,8 +365,8 @@ impl<'a> Sampler<'a> {
                 Strip {
                     low: vec![0; labels * 2 * line],
                     high: vec![0; labels * 2 * line],
-                    inside: vec![0; labels * 2 * line],
-                    inside_at: at.clone(),
+                    blocker: vec![OUTSIDE; labels * 2 * line],
+                    blocker_at: at.clone(),
                     at,
                     scratch: vec![0; 2 * (side.width + 2) + 2 * motions.len() * (board.width + 1)],
                 }
@@ -370,9 +380,9 @@ impl<'a> Sampler<'a> {
             Self::Rows { side, radius, .. } => {
                 let from = (y + side.margin_rows) * side.width;
                 let row = &side.luminance[from..from + side.width];
-                let inside = &side.inside[from..from + side.width];
+                let blocker = &side.blocker[from..from + side.width];
                 // SAFETY: `isa` is available; the kernel is safe code.
-                unsafe { fill_phases(isa, row, inside, *radius, strip) };
+                unsafe { fill_phases(isa, row, blocker, *radius, strip) };
             }
             Self::Free { side, motions } => fill_free(isa, side, motions, y, board, strip),
         }
@@ -380,22 +390,22 @@ impl<'a> Sampler<'a> {
 }
 
 for_each_isa! {
-    unsafe fn fill_phases = fill_phases_kernel(row: &[u8], inside: &[u8], radius: isize, strip: &mut Strip)
+    unsafe fn fill_phases = fill_phases_kernel(row: &[u8], blocker: &[u8], radius: isize, strip: &mut Strip)
 }
 
 /// The row at eight sub-pixel phases, even and odd pixels apart, with the interval to `radius` eighths around. Sample `i`
 /// of phase `q` in 0..16 stands at pixel `2 i + q / 8`.
 #[inline(always)]
-fn fill_phases_kernel<V: Lanes>(row: &[u8], inside: &[u8], radius: isize, strip: &mut Strip) {
+fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip: &mut Strip) {
     let line = row.len().div_ceil(2) + VECTOR_SLACK;
     let n = row.len().div_ceil(2);
-    let Strip { low, high, inside: votes, scratch, .. } = strip;
+    let Strip { low, high, blocker: blockers, scratch, .. } = strip;
     let (phases, pixels) = scratch.split_at_mut(2 * PHASES * line);
     let (row_even, rest) = pixels.split_at_mut(line);
     let (row_odd, rest) = rest.split_at_mut(line);
-    let (inside_even, inside_odd) = rest.split_at_mut(line);
+    let (blocker_even, blocker_odd) = rest.split_at_mut(line);
     part(row, row_even, row_odd);
-    part(inside, inside_even, inside_odd);
+    part(blocker, blocker_even, blocker_odd);
     // One sample of margin at the front, for intervals that begin before the row, and one at the end.
     for phase in 0..PHASES {
         let (w1, w0) = (phase as u16, (PHASES - phase) as u16);
@@ -431,10 +441,10 @@ fn fill_phases_kernel<V: Lanes>(row: &[u8], inside: &[u8], radius: isize, strip:
     }
     // A sample between two pixels needs both.
     for i in 0..n {
-        votes[i] = inside_even[i];
-        votes[line + i] = inside_even[i] & inside_odd[i];
-        votes[2 * line + i] = inside_odd[i];
-        votes[3 * line + i] = inside_odd[i] & inside_even[i + 1];
+        blockers[i] = blocker_even[i];
+        blockers[line + i] = blocker_even[i].max(blocker_odd[i]);
+        blockers[2 * line + i] = blocker_odd[i];
+        blockers[3 * line + i] = blocker_odd[i].max(blocker_even[i + 1]);
     }
 }
 
@@ -455,13 +465,13 @@ fn part(row: &[u8], even: &mut [u8], odd: &mut [u8]) {
 
 /// Every label's row sampled by itself, where a hypothesis also shifts rows or scales.
 fn fill_free(isa: Isa, side: &Side, motions: &[(f64, f64, f64)], y: usize, board: &Checkerboard, strip: &mut Strip) {
-    let Strip { low, high, inside, at, scratch, .. } = strip;
+    let Strip { low, high, blocker, at, scratch, .. } = strip;
     let (scratch, samples) = scratch.split_at_mut(2 * (side.width + 2));
-    let (values, votes) = samples.split_at_mut(motions.len() * (board.width + 1));
-    let rows = values.chunks_exact_mut(board.width + 1).zip(votes.chunks_exact_mut(board.width + 1));
-    for ((scale, x0, y0), (values, votes)) in motions.iter().zip(rows) {
+    let (values, blockers) = samples.split_at_mut(motions.len() * (board.width + 1));
+    let rows = values.chunks_exact_mut(board.width + 1).zip(blockers.chunks_exact_mut(board.width + 1));
+    for ((scale, x0, y0), (values, blockers)) in motions.iter().zip(rows) {
         // SAFETY: `isa` is available; the kernel is safe code.
-        unsafe { sample_row(isa, side, (*scale, *x0, *y0), y, board.width, scratch, values, votes) };
+        unsafe { sample_row(isa, side, (*scale, *x0, *y0), y, board.width, scratch, values, blockers) };
     }
     let row = |values: &[u8], half_label: usize, x: usize| values[half_label * (board.width + 1) + x];
     for (label, at) in at.iter().enumerate() {
@@ -472,7 +482,7 @@ fn fill_free(isa: Isa, side: &Side, motions: &[(f64, f64, f64)], y: usize, board
                 let (before, here, after) = (of(2 * label), of(2 * label + 1), of(2 * label + 2));
                 low[at + i] = before.min(here).min(after);
                 high[at + i] = before.max(here).max(after);
-                inside[at + i] = row(votes, 2 * label + 1, x);
+                blocker[at + i] = row(blockers, 2 * label + 1, x);
             }
         }
     }
@@ -480,7 +490,7 @@ fn fill_free(isa: Isa, side: &Side, motions: &[(f64, f64, f64)], y: usize, board
 
 for_each_isa! {
     unsafe fn sample_row = sample_row_kernel(
-        side: &Side, motion: (f64, f64, f64), y: usize, width: usize, scratch: &mut [u8], values: &mut [u8], votes: &mut [u8],
+        side: &Side, motion: (f64, f64, f64), y: usize, width: usize, scratch: &mut [u8], values: &mut [u8], blockers: &mut [u8],
     )
 }
 
@@ -492,25 +502,25 @@ fn sample_row_kernel<V: Lanes>(
     width: usize,
     scratch: &mut [u8],
     values: &mut [u8],
-    votes: &mut [u8],
+    blockers: &mut [u8],
 ) {
     let sixteenths = ((y as f64 * scale + y0 + side.margin_rows as f64) * 16.0).round() as i64;
     let rows = (side.luminance.len() / side.width) as i64;
     let (upper, weight) = (sixteenths.div_euclid(16), sixteenths.rem_euclid(16) as u16);
     if upper < 0 || upper + 1 >= rows {
-        votes.fill(0);
+        blockers.fill(OUTSIDE);
         values.fill(0);
         return;
     }
     let upper = upper as usize * side.width;
-    let (blend, seen) = scratch.split_at_mut(side.width + 2);
+    let (blend, blocked) = scratch.split_at_mut(side.width + 2);
     let (a, b) = side.luminance[upper..upper + 2 * side.width].split_at(side.width);
     for ((to, a), b) in blend.iter_mut().zip(a).zip(b) {
         *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + 8) / 16) as u8;
     }
-    let (a, b) = side.inside[upper..upper + 2 * side.width].split_at(side.width);
-    for ((to, a), b) in seen.iter_mut().zip(a).zip(b) {
-        *to = if weight == 0 { *a } else { *a & *b };
+    let (a, b) = side.blocker[upper..upper + 2 * side.width].split_at(side.width);
+    for ((to, a), b) in blocked.iter_mut().zip(a).zip(b) {
+        *to = if weight == 0 { *a } else { *a.max(b) };
     }
     let last = side.width as i64 - 2;
     let first = x0 + side.margin as f64;
@@ -518,24 +528,24 @@ fn sample_row_kernel<V: Lanes>(
         let sixteenths = (first * 16.0).round() as i64;
         let (pixel, weight) = (sixteenths.div_euclid(16), sixteenths.rem_euclid(16) as u16);
         let pixel = pixel.clamp(0, last + 1 - width as i64) as usize;
-        let (blend, seen) = (&blend[pixel..pixel + width + 1], &seen[pixel..pixel + width + 1]);
+        let (blend, blocked) = (&blend[pixel..pixel + width + 1], &blocked[pixel..pixel + width + 1]);
         for ((to, a), b) in values[..width].iter_mut().zip(blend).zip(&blend[1..]) {
             *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + 8) / 16) as u8;
         }
-        for ((to, a), b) in votes[..width].iter_mut().zip(seen).zip(&seen[1..]) {
-            *to = if weight == 0 { *a } else { *a & *b };
+        for ((to, a), b) in blockers[..width].iter_mut().zip(blocked).zip(&blocked[1..]) {
+            *to = if weight == 0 { *a } else { *a.max(b) };
         }
         return;
     }
     // 16.16 fixed point along the row.
     let (mut position, step) = ((first * 65536.0).round() as i64, (scale * 65536.0).round() as i64);
-    for (value, vote) in values[..width].iter_mut().zip(votes.iter_mut()) {
+    for (value, blocker) in values[..width].iter_mut().zip(blockers.iter_mut()) {
         let pixel = position >> 16;
         let at = pixel.clamp(0, last) as usize;
         let weight = ((position >> 12) & 15) as u16;
         let (a, b) = (u16::from(blend[at]), u16::from(blend[at + 1]));
         *value = ((a * (16 - weight) + b * weight + 8) / 16) as u8;
-        *vote = if pixel == at as i64 { seen[at] & seen[at + 1] } else { 0 };
+        *blocker = if pixel == at as i64 { blocked[at].max(blocked[at + 1]) } else { OUTSIDE };
         position += step;
     }
 }
@@ -555,6 +565,7 @@ pub(super) struct Sweep<'a> {
     middle: Middle<'a>,
     range: &'a InverseDepthRange,
     samplers: [Sampler<'a>; 2],
+    tolerance: usize,
     board: Checkerboard,
 }
 
@@ -576,7 +587,8 @@ impl<'a> Sweep<'a> {
     ) -> Self {
         let board = Checkerboard::new(middle.intrinsics.width, middle.intrinsics.height);
         let samplers = sides.map(|side| Sampler::new(side, middle.intrinsics, range));
-        Self { isa, settings, middle, range, samplers, board }
+        let tolerance = sides.iter().flatten().map(|side| side.tolerance(range)).max().unwrap_or(0);
+        Self { isa, settings, middle, range, samplers, tolerance, board }
     }
 
     pub fn scratch(&self) -> Scratch {
@@ -619,6 +631,7 @@ impl<'a> Sweep<'a> {
                 expected: middle.expected_depth_m.map(|_| &expected[..]),
                 strips,
                 parity,
+                tolerance: self.tolerance,
                 board,
             };
             half_row.check(labels, costs);
@@ -644,6 +657,8 @@ struct HalfRow<'a> {
     expected: Option<&'a [u8]>,
     strips: &'a [Strip; 2],
     parity: usize,
+    /// Labels by which a blocker must be nearer.
+    tolerance: usize,
     board: &'a Checkerboard,
 }
 
@@ -654,9 +669,9 @@ impl HalfRow<'_> {
         assert!(self.expected.is_none_or(|expected| expected.len() >= reach));
         for strip in self.strips {
             let end = |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
-            assert!(strip.at.len() == labels && strip.inside_at.len() == labels);
+            assert!(strip.at.len() == labels && strip.blocker_at.len() == labels);
             assert!(strip.low.len().min(strip.high.len()) >= end(&strip.at));
-            assert!(strip.inside.len() >= end(&strip.inside_at));
+            assert!(strip.blocker.len() >= end(&strip.blocker_at));
         }
     }
 }
@@ -675,13 +690,13 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
         let most = V::splat(settings.most_difference);
         let occlusion = V::splat(settings.occlusion);
         let most_surprise = V::splat(settings.most_surprise);
-        let one = V::splat(1);
+        let unseen = V::splat(settings.unseen);
         for start in Checkerboard::vector_starts(half, V::N) {
             let luminance = V::load(row.luminance.as_ptr().add(start));
             for label in 0..labels {
                 // Plain loops: a closure would be a function of its own, without the vector instructions.
                 let mut differences = [most; 2];
-                let mut votes = [most; 2];
+                let mut blockers = [most; 2];
                 for side in 0..2 {
                     let strip = &row.strips[side];
                     let at = strip.at.get_unchecked(label)[row.parity] + start;
@@ -689,14 +704,15 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
                     let high = V::load(strip.high.as_ptr().add(at));
                     let difference = luminance.sub_saturating(high).max(low.sub_saturating(luminance));
                     differences[side] = difference.min(most);
-                    let inside_at = strip.inside_at.get_unchecked(label)[row.parity] + start;
-                    votes[side] = V::load(strip.inside.as_ptr().add(inside_at));
+                    let blocker_at = strip.blocker_at.get_unchecked(label)[row.parity] + start;
+                    blockers[side] = V::load(strip.blocker.as_ptr().add(blocker_at));
                 }
-                let ([left, right], [left_votes, right_votes]) = (differences, votes);
-                let l = left.replace_where_less(left_votes, one, right);
-                let r = right.replace_where_less(right_votes, one, left);
+                let ([left, right], [left_blocker, right_blocker]) = (differences, blockers);
+                let passes = V::splat((label + row.tolerance).min(OUTSIDE as usize - 1) as u8);
+                let l = left.replace_where_less(passes, left_blocker, right);
+                let r = right.replace_where_less(passes, right_blocker, left);
                 let mut cost = l.average(r).min(l.min(r).add(occlusion));
-                cost = cost.replace_where_less(left_votes.max(right_votes), one, most);
+                cost = cost.replace_where_less(passes, left_blocker.min(right_blocker), unseen);
                 if let Some(expected) = row.expected {
                     let expected = V::load(expected.as_ptr().add(start));
                     let here = V::splat(label as u8);
@@ -741,43 +757,83 @@ pub(super) fn match_exposure(middle: &[u8], side: &[u8]) -> [u8; 256] {
 
 /// Where a side sees the middle's pixels at one hypothesis, in its turned image.
 #[derive(Clone, Copy)]
-pub(super) struct Placing {
+struct Placing {
     scale: f32,
     x: f32,
     y: f32,
 }
 
-impl Placing {
-    /// Index in [`Side::inside`]; `None` outside the canvas.
-    pub fn of(&self, side: &Side, x: usize, y: usize) -> Option<usize> {
-        // Rounds, as what is added contains a half; what is negative is not in 0.. as an integer either.
-        let u = (x as f32 * self.scale + self.x) as i32;
-        let v = (y as f32 * self.scale + self.y) as i32;
-        let at = v as usize * side.width + u as usize;
-        (u >= 0 && v >= 0 && u < side.width as i32 && at < side.inside.len()).then_some(at)
-    }
-}
-
 impl Side {
-    pub fn placing(&self, inverse_depth: f64) -> Placing {
-        let (scale, x, y) = self.motion.at(inverse_depth);
-        Placing {
-            scale: scale as f32,
-            x: (x + self.margin as f64 + 0.5) as f32,
-            y: (y + self.margin_rows as f64 + 0.5) as f32,
-        }
+    fn placings(&self, range: &InverseDepthRange) -> Vec<Placing> {
+        let placing = |label: usize| {
+            let (scale, x, y) = self.motion.at(range.inverse_depth(label as f64));
+            Placing {
+                scale: scale as f32,
+                x: (x + self.margin as f64 + 0.5) as f32,
+                y: (y + self.margin_rows as f64 + 0.5) as f32,
+            }
+        };
+        (0..range.labels).map(placing).collect()
     }
 
-    /// How many labels move the middle of the image by a pixel; not more than there are.
-    pub fn labels_per_pixel(&self, range: &InverseDepthRange) -> f64 {
+    /// Index on the canvas; `None` beyond it.
+    fn place(&self, placing: Placing, x: usize, y: usize) -> Option<usize> {
+        // Rounds, as what is added contains a half.
+        let u = (x as f32 * placing.scale + placing.x) as i32;
+        let v = (y as f32 * placing.scale + placing.y) as i32;
+        let at = v as usize * self.width + u as usize;
+        (u >= 0 && v >= 0 && u < self.width as i32 && at < self.blocker.len()).then_some(at)
+    }
+
+    /// A slanted surface puts neighbours up to a pixel apart in one place: only what is nearer by more labels than
+    /// these hides what is behind.
+    pub fn tolerance(&self, range: &InverseDepthRange) -> usize {
         let (far, near) = (self.motion.at(range.far), self.motion.at(range.near));
         let centre = |(scale, x, y): (f64, f64, f64)| (scale * self.motion.cx + x, scale * self.motion.cy + y);
         let ((x0, y0), (x1, y1)) = (centre(far), centre(near));
-        range.labels as f64 / (x1 - x0).hypot(y1 - y0).max(1.0)
+        let labels_per_pixel = range.labels as f64 / (x1 - x0).hypot(y1 - y0).max(1.0);
+        labels_per_pixel.ceil() as usize + 1
     }
 
-    /// 255 where the side has an image, row by row of its canvas.
-    pub fn inside(&self) -> &[u8] {
-        &self.inside
+    /// Lets the middle's pixels block the view of what is behind them: `labels_of(y)` is a row's labels.
+    pub fn block<L: Iterator<Item = u8>>(
+        &mut self,
+        range: &InverseDepthRange,
+        height: usize,
+        labels_of: impl Fn(usize) -> L,
+    ) {
+        self.blocker.clone_from(&self.outside);
+        let placings = self.placings(range);
+        for y in 0..height {
+            for (x, label) in labels_of(y).enumerate() {
+                if let Some(at) = self.place(placings[usize::from(label)], x, y) {
+                    self.blocker[at] = self.blocker[at].max(label);
+                }
+            }
+        }
+    }
+
+    /// Adds `bit` where nothing blocks the view of a row's labels.
+    pub fn mark_seen(
+        &self,
+        range: &InverseDepthRange,
+        height: usize,
+        beliefs: &[Belief],
+        bit: u8,
+        seen_by: &mut [u8],
+    ) {
+        let placings = self.placings(range);
+        let tolerance = self.tolerance(range);
+        let width = beliefs.len() / height;
+        let rows = beliefs.chunks_exact(width).zip(seen_by.chunks_exact_mut(width));
+        for (y, (beliefs, seen_by)) in rows.enumerate() {
+            for (x, (belief, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
+                let label = belief.label;
+                if let Some(at) = self.place(placings[usize::from(label)], x, y) {
+                    let passes = (usize::from(label) + tolerance).min(usize::from(OUTSIDE) - 1);
+                    *seen_by |= if usize::from(self.blocker[at]) <= passes { bit } else { 0 };
+                }
+            }
+        }
     }
 }

@@ -5,10 +5,7 @@
 //! ray passes one that the side sees nearer by more than a label and a pixel; no depth where no side sees it or
 //! where a label elsewhere is believed as much.
 
-use super::{
-    messages::Belief,
-    plane_sweep::{InverseDepthRange, Side},
-};
+use super::messages::Belief;
 use rayon::prelude::*;
 
 /// Pixels to each side over which labels are averaged.
@@ -44,37 +41,4 @@ pub(super) fn refine(beliefs: &[Belief], width: usize, along_rows: &mut [f32], r
             *to = sum / count;
         }
     });
-}
-
-/// Marks with `bit` the pixels that the side sees. `nearest` is scratch.
-pub(super) fn mark_seen(
-    side: &Side,
-    range: &InverseDepthRange,
-    beliefs: &[Belief],
-    width: usize,
-    bit: u8,
-    nearest: &mut Vec<u8>,
-    seen_by: &mut [u8],
-) {
-    nearest.clear();
-    nearest.resize(side.inside().len(), 0);
-    let placings: Vec<_> = (0..range.labels).map(|label| side.placing(range.inverse_depth(label as f64))).collect();
-    // A slanted surface puts neighbours that lie up to a pixel apart in one place.
-    let labels_per_pixel = side.labels_per_pixel(range).ceil() as u8;
-    let rows = || beliefs.chunks_exact(width).enumerate();
-    for (y, row) in rows() {
-        for (x, belief) in row.iter().enumerate() {
-            if let Some(at) = placings[usize::from(belief.label)].of(side, x, y) {
-                nearest[at] = nearest[at].max(belief.label);
-            }
-        }
-    }
-    for ((y, row), seen_by) in rows().zip(seen_by.chunks_exact_mut(width)) {
-        for ((x, belief), seen_by) in row.iter().enumerate().zip(seen_by) {
-            if let Some(at) = placings[usize::from(belief.label)].of(side, x, y) {
-                let clear = nearest[at] <= belief.label.saturating_add(labels_per_pixel.saturating_add(1));
-                *seen_by |= if clear { bit & side.inside()[at] } else { 0 };
-            }
-        }
-    }
 }
