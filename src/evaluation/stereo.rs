@@ -69,7 +69,7 @@ impl StereoScene {
     }
 
     /// A rig whose inverse depth in 1/m *is* the disparity in pixels: baseline 1 m, focal length 1 pixel.
-    fn rig(&self, cameras: Cameras) -> DepthRig {
+    pub fn rig(&self, cameras: Cameras) -> DepthRig {
         let intrinsics = Intrinsics {
             width: self.width,
             height: self.height,

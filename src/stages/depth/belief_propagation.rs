@@ -192,20 +192,9 @@ impl BeliefPropagation {
     pub fn solve(&mut self, contrast: &Contrast) -> &[Belief] {
         self.levels[0].weigh(&self.settings, Some(contrast));
         for at in (0..self.levels.len()).rev() {
-            self.propagate(at, 0);
+            self.propagate(at);
         }
         &self.beliefs
-    }
-
-    /// Beliefs of 2x2 pixels each, for a quarter of the time, and how many there are in a row; of single pixels if there
-    /// is one level only.
-    pub fn guess(&mut self) -> (&[Belief], usize) {
-        let finest = 1.min(self.levels.len() - 1);
-        for at in (finest..self.levels.len()).rev() {
-            self.propagate(at, finest);
-        }
-        let board = self.levels[finest].costs.board;
-        (&self.beliefs[..board.width * board.height], board.width)
     }
 
     /// Of the last [`solve`](Self::solve).
@@ -213,8 +202,8 @@ impl BeliefPropagation {
         &self.beliefs
     }
 
-    /// All iterations of one level, and then what the next finer one gets, or at level `finest` the caller.
-    fn propagate(&mut self, at: usize, finest: usize) {
+    /// All iterations of one level, and then what the next finer one or the caller gets.
+    fn propagate(&mut self, at: usize) {
         let Self { settings, isa, levels, beliefs } = self;
         let (finer, level) = levels.split_at_mut(at);
         let Level { costs, weights, first, rings } = &mut level[0];
@@ -227,8 +216,8 @@ impl BeliefPropagation {
         let slots = (settings.iterations + 3).next_multiple_of(2);
         rings.resize_with(bands, || (0..slots).map(|_| AlignedBytes::zeroed(8 * costs.labels * stride)).collect());
         let walk = Walk { costs, weights, first, iterations: settings.iterations, isa: *isa };
-        let outputs: Vec<Output<'_>> = match finer.last_mut().filter(|_| at > finest) {
-            None => beliefs[..width * height].chunks_mut(width * rows).map(Output::Beliefs).collect(),
+        let outputs: Vec<Output<'_>> = match finer.last_mut() {
+            None => beliefs.chunks_mut(width * rows).map(Output::Beliefs).collect(),
             Some(finer) => {
                 let (labels, stride) = (finer.costs.labels, finer.costs.board.stride);
                 finer

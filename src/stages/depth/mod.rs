@@ -125,19 +125,8 @@ impl DepthEstimator {
             .propagation
             .get_or_insert_with(|| BeliefPropagation::new(settings.propagation, width, height, range.labels, isa));
         find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
-        // First what is in front at half the resolution, then with each side's vote only where that leaves it a view.
-        for visible in [false, true] {
-            if visible {
-                let (guess, half) = if std::env::var("FULL").is_ok() { (propagation.solve(&self.contrast), width) } else { propagation.guess() };
-                let scale = width.div_ceil(half);
-                for side in &mut self.sides {
-                    side.block(range, height, |y| {
-                        let row = &guess[y / scale * half..][..half];
-                        row.iter().flat_map(move |belief| std::iter::repeat_n(belief.label, scale)).take(width)
-                    });
-                }
-            }
-            let [left, right] = &self.sides;
+        let sweep_and_solve = |propagation: &mut BeliefPropagation, sides: &[Side; 2]| {
+            let [left, right] = sides;
             let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
             let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
             let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
@@ -146,8 +135,15 @@ impl DepthEstimator {
                 || sweep.scratch(),
                 |scratch, y, row| sweep.fill_row(scratch, y, row),
             );
+            propagation.solve(&self.contrast);
+        };
+        // Who stands in front of whom is known only after a first answer; then a side has no vote where it has no view.
+        sweep_and_solve(propagation, &self.sides);
+        for side in &mut self.sides {
+            side.block(range, propagation.beliefs(), width);
         }
-        let beliefs = propagation.solve(&self.contrast);
+        sweep_and_solve(propagation, &self.sides);
+        let beliefs = propagation.beliefs();
 
         let map = &mut self.map;
         map.label_step = range.step() as f32;
@@ -159,9 +155,8 @@ impl DepthEstimator {
         let bits = [(rig.left, SEEN_BY_LEFT), (rig.right, SEEN_BY_RIGHT)];
         for (side, (camera, bit)) in self.sides.iter_mut().zip(bits) {
             if camera.is_some() {
-                let labels_of = |y: usize| beliefs[y * width..][..width].iter().map(|belief| belief.label);
-                side.block(range, height, labels_of);
-                side.mark_seen(range, height, beliefs, bit, &mut map.seen_by);
+                side.block(range, beliefs, width);
+                side.mark_seen(range, beliefs, width, bit, &mut map.seen_by);
             }
         }
         map.depth_m.resize(pixels, 0.0);

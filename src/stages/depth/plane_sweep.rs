@@ -795,42 +795,36 @@ impl Side {
         labels_per_pixel.ceil() as usize + 1
     }
 
-    /// Lets the middle's pixels block the view of what is behind them: `labels_of(y)` is a row's labels.
-    pub fn block<L: Iterator<Item = u8>>(
-        &mut self,
-        range: &InverseDepthRange,
-        height: usize,
-        labels_of: impl Fn(usize) -> L,
-    ) {
+    /// Lets the middle's pixels, `width` in a row, block the view of what is behind them.
+    pub fn block(&mut self, range: &InverseDepthRange, beliefs: &[Belief], width: usize) {
         self.blocker.clone_from(&self.outside);
         let placings = self.placings(range);
-        for y in 0..height {
-            for (x, label) in labels_of(y).enumerate() {
-                if let Some(at) = self.place(placings[usize::from(label)], x, y) {
-                    self.blocker[at] = self.blocker[at].max(label);
+        for (y, row) in beliefs.chunks_exact(width).enumerate() {
+            for (x, Belief { label, .. }) in row.iter().enumerate() {
+                if let Some(at) = self.place(placings[usize::from(*label)], x, y) {
+                    self.blocker[at] = self.blocker[at].max(*label);
                 }
             }
         }
     }
 
-    /// Adds `bit` where nothing blocks the view of a row's labels.
+    /// Adds `bit` where nothing blocks the view of a pixel's label.
     pub fn mark_seen(
         &self,
         range: &InverseDepthRange,
-        height: usize,
         beliefs: &[Belief],
+        width: usize,
         bit: u8,
         seen_by: &mut [u8],
     ) {
         let placings = self.placings(range);
         let tolerance = self.tolerance(range);
-        let width = beliefs.len() / height;
         let rows = beliefs.chunks_exact(width).zip(seen_by.chunks_exact_mut(width));
         for (y, (beliefs, seen_by)) in rows.enumerate() {
-            for (x, (belief, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
-                let label = belief.label;
-                if let Some(at) = self.place(placings[usize::from(label)], x, y) {
-                    let passes = (usize::from(label) + tolerance).min(usize::from(OUTSIDE) - 1);
+            for (x, (Belief { label, .. }, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
+                let label = usize::from(*label);
+                if let Some(at) = self.place(placings[label], x, y) {
+                    let passes = (label + tolerance).min(usize::from(OUTSIDE) - 1);
                     *seen_by |= if usize::from(self.blocker[at]) <= passes { bit } else { 0 };
                 }
             }
