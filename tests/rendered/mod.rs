@@ -41,10 +41,6 @@ pub struct Sensor {
     pub seed: u32,
 }
 
-impl Sensor {
-    pub const IDEAL: Self = Self { gain: 1.0, offset: 0.0, noise: 0.0, seed: 0 };
-}
-
 fn hash(mut value: u32) -> u32 {
     value = (value ^ (value >> 16)).wrapping_mul(0x7feb_352d);
     value = (value ^ (value >> 15)).wrapping_mul(0x846c_a68b);

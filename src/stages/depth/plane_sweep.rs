@@ -788,11 +788,16 @@ impl Side {
     /// A slanted surface puts neighbours up to a pixel apart in one place: only what is nearer by more labels than
     /// these hides what is behind.
     pub fn tolerance(&self, range: &InverseDepthRange) -> usize {
+        let labels = (1.0 / self.pixels_per_label(range)).min(range.labels as f64);
+        labels.ceil() as usize + 1
+    }
+
+    /// How far one label moves the middle of the image, on average.
+    pub fn pixels_per_label(&self, range: &InverseDepthRange) -> f64 {
         let (far, near) = (self.motion.at(range.far), self.motion.at(range.near));
         let centre = |(scale, x, y): (f64, f64, f64)| (scale * self.motion.cx + x, scale * self.motion.cy + y);
         let ((x0, y0), (x1, y1)) = (centre(far), centre(near));
-        let labels_per_pixel = range.labels as f64 / (x1 - x0).hypot(y1 - y0).max(1.0);
-        labels_per_pixel.ceil() as usize + 1
+        (x1 - x0).hypot(y1 - y0) / (range.labels - 1) as f64
     }
 
     /// Lets the middle's pixels, `width` in a row, block the view of what is behind them.
