@@ -205,7 +205,8 @@ fn believes_as_the_reference(case: &Case) {
                             }
                         },
                     );
-                    propagation.solve(&contrast).to_vec()
+                    propagation.set_contrast(&contrast);
+                    propagation.solve().to_vec()
                 });
                 let got: Vec<u8> = beliefs.iter().map(|belief| belief.label).collect();
                 assert_eq!(got, expected, "{isa:?}, {threads} threads, round {round}");

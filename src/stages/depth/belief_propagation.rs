@@ -124,6 +124,11 @@ impl BeliefPropagation {
         &self.levels[0].costs
     }
 
+    /// Sets where depth may jump more cheaply; without, nowhere.
+    pub fn set_contrast(&mut self, contrast: &Contrast) {
+        self.levels[0].weigh(&self.settings, Some(contrast));
+    }
+
     /// Sets the costs of the next [`solve`](Self::solve), row by row: `fill_row(state, y, row)` with a state from `init`
     /// for each thread's piece of work. `highest_cost` bounds what it writes; costs may be lowered afterwards by their
     /// pixel's least, and what is far above it cut.
@@ -189,8 +194,7 @@ impl BeliefPropagation {
 
     /// Beliefs of all pixels, row by row. Runs on the threads of the current rayon pool; the result does not depend on
     /// their number.
-    pub fn solve(&mut self, contrast: &Contrast) -> &[Belief] {
-        self.levels[0].weigh(&self.settings, Some(contrast));
+    pub fn solve(&mut self) -> &[Belief] {
         for at in (0..self.levels.len()).rev() {
             self.propagate(at);
         }
@@ -364,34 +368,56 @@ impl Level {
         }
         let PropagationSettings { smooth, across_contrast, .. } = *settings;
         let alike = vec![0; width];
-        self.weights.par_chunks_exact_mut(16 * stride).enumerate().for_each(|(y, weights)| {
-            let row = |differs: fn(&Contrast) -> &[u8], y: usize| {
-                contrast.map_or(&alike[..], |contrast| &differs(contrast)[y * width..][..width])
-            };
-            let right = row(|contrast| &contrast.right, y);
-            let below = row(|contrast| &contrast.below, y);
-            let above = row(|contrast| &contrast.below, y.saturating_sub(1));
-            for (colour, weights) in weights.chunks_exact_mut(8 * stride).enumerate() {
-                let parity = Checkerboard::parity(y, colour);
-                let own = |row: &[u8], i: usize| row.get(2 * i + parity).copied();
-                for i in 0..half {
-                    let mut put = |neighbour: usize, differs: Option<u8>| {
-                        let Smoothness { step, truncation } = match differs {
-                            None => Smoothness { step: 0, truncation: 0 },
-                            Some(0) => smooth,
-                            Some(_) => across_contrast,
-                        };
-                        weights[neighbour * stride + i] = step;
-                        weights[(4 + neighbour) * stride + i] = truncation;
-                    };
-                    put(RIGHT, own(&right[..width - 1], i));
-                    put(LEFT, (2 * i + parity).checked_sub(1).and_then(|x| right[..width - 1].get(x).copied()));
-                    put(BELOW, if y + 1 < height { own(below, i) } else { None });
-                    put(ABOVE, if y > 0 { own(above, i) } else { None });
+        let isa = Isa::detect();
+        self.weights.par_chunks_exact_mut(16 * stride).enumerate().for_each_init(
+            || [(); 4].map(|()| vec![0; 2 * half + 1]),
+            |classes, (y, weights)| {
+                let row = |differs: fn(&Contrast) -> &[u8], y: usize| {
+                    contrast.map_or(&alike[..], |contrast| &differs(contrast)[y * width..][..width])
+                };
+                // Per pixel towards each neighbour: 0 = alike, 1 = not, 2 = there is none.
+                let mut put = |neighbour: usize, first: usize, edges: &[u8]| {
+                    let class = &mut classes[neighbour];
+                    class.fill(NO_EDGE);
+                    for (class, differs) in class[first..].iter_mut().zip(edges) {
+                        *class = u8::from(*differs > 0);
+                    }
+                };
+                put(RIGHT, 0, &row(|contrast| &contrast.right, y)[..width - 1]);
+                put(LEFT, 1, &row(|contrast| &contrast.right, y)[..width - 1]);
+                put(BELOW, 0, if y + 1 < height { row(|contrast| &contrast.below, y) } else { &[] });
+                put(ABOVE, 0, if y > 0 { row(|contrast| &contrast.below, y - 1) } else { &[] });
+                for (colour, weights) in weights.chunks_exact_mut(8 * stride).enumerate() {
+                    let parity = Checkerboard::parity(y, colour);
+                    for (neighbour, class) in classes.iter().enumerate() {
+                        let (steps, truncations) = weights[neighbour * stride..].split_at_mut(4 * stride);
+                        let class = &class[parity..parity + 2 * half];
+                        weigh_edges(isa, class, [smooth.step, across_contrast.step], &mut steps[..half]);
+                        let truncation = [smooth.truncation, across_contrast.truncation];
+                        weigh_edges(isa, class, truncation, &mut truncations[..half]);
+                    }
                 }
-            }
-        });
+            },
+        );
     }
+}
+
+const NO_EDGE: u8 = 2;
+
+/// Of every second class its value, 0 where there is no edge.
+fn weigh_edges(isa: Isa, classes: &[u8], values: [u8; 2], weights: &mut [u8]) {
+    #[inline(always)]
+    fn run<V: Lanes>(classes: &[u8], values: [u8; 2], weights: &mut [u8]) {
+        for (weight, class) in weights.iter_mut().zip(classes.as_chunks::<2>().0) {
+            let value = if class[0] == 0 { values[0] } else { values[1] };
+            *weight = if class[0] == NO_EDGE { 0 } else { value };
+        }
+    }
+    for_each_isa! {
+        unsafe fn dispatched = run(classes: &[u8], values: [u8; 2], weights: &mut [u8])
+    }
+    // SAFETY: `isa` is available; the kernel is safe code.
+    unsafe { dispatched(isa, classes, values, weights) }
 }
 
 /// What a band leaves behind.
@@ -462,6 +488,7 @@ impl Walk<'_> {
             parity: Checkerboard::parity(y, colour),
             costs: self.costs.half_row(y, colour),
             received,
+            ask_for_next: false,
             weights: &self.weights[(2 * y + colour) * 8 * stride..][..8 * stride],
         }
     }
@@ -483,7 +510,10 @@ impl Walk<'_> {
         };
         let other = (1 - colour) * block..(2 - colour) * block;
         let (above, below) = (&mut above[other.clone()], &mut below[other]);
-        messages::send(self.isa, &self.sender(y, colour, received), above, row, below);
+        let mut sender = self.sender(y, colour, received);
+        // Two rows share what was handed down.
+        sender.ask_for_next = iteration == 0 && y % 2 == 1;
+        messages::send(self.isa, &sender, above, row, below);
     }
 
     fn put(&self, y: usize, row: usize, messages: &[u8], output: &mut Output<'_>) {

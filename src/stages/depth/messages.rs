@@ -24,6 +24,8 @@ pub(super) struct Sender<'a> {
     pub costs: &'a [u8],
     /// `[neighbour][label][index]`, received.
     pub received: &'a [u8],
+    /// What is received follows in memory for the next row, but not yet in the cache.
+    pub ask_for_next: bool,
     /// `[neighbour][index]` steps, then as many truncations, of the edge towards that neighbour; both are 0 where
     /// sender or neighbour are outside the image, so that nothing is said across the border.
     pub weights: &'a [u8],
@@ -97,8 +99,13 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
             let mut least = [V::splat(255); 4];
             for label in 0..labels {
                 let at = label * stride;
-                // The same pixels one row on are next; the costs alone come from far away.
+                // The same pixels one row on are next.
                 V::prefetch(costs.wrapping_add(at + 2 * plane));
+                if sender.ask_for_next {
+                    for k in 0..4 {
+                        V::prefetch(received.wrapping_add((4 + k) * plane + at));
+                    }
+                }
                 let mut from = [V::splat(0); 4];
                 for k in 0..4 {
                     from[k] = V::load(received.add(k * plane + at));

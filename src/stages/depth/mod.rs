@@ -153,6 +153,7 @@ impl DepthEstimator {
             .propagation
             .get_or_insert_with(|| BeliefPropagation::new(kind.3, width, height, range.labels, isa));
         find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
+        propagation.set_contrast(&self.contrast);
         let sweep_and_solve = |propagation: &mut BeliefPropagation, sides: &[Side; 2]| {
             let [left, right] = sides;
             let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
@@ -163,7 +164,7 @@ impl DepthEstimator {
                 || sweep.scratch(),
                 |scratch, y, row| sweep.fill_row(scratch, y, row),
             );
-            propagation.solve(&self.contrast);
+            propagation.solve();
         };
         // Who stands in front of whom is known only after a first answer; then a side has no vote where it has no view.
         sweep_and_solve(propagation, &self.sides);
