@@ -20,8 +20,11 @@ fn main() {
     let mut estimators = HashMap::new();
     for line in std::io::stdin().lock().lines() {
         let line = line.expect("standard input is text");
-        let [folder, labels, most_disparity, cameras, threads] =
-            line.split_whitespace().collect::<Vec<_>>().try_into().expect("five words a line");
+        let [folder, labels, most_disparity, cameras, threads] = line
+            .split_whitespace()
+            .collect::<Vec<_>>()
+            .try_into()
+            .expect("five words a line");
         let scene = scenes
             .entry(folder.to_owned())
             .or_insert_with(|| StereoScene::open(Path::new(folder)).expect("a scene"));
@@ -31,16 +34,30 @@ fn main() {
             labels.parse().expect("a number of labels"),
         )
         .expect("a range");
-        let cameras = if cameras == "2" { Cameras::Two } else { Cameras::Three };
+        let cameras = if cameras == "2" {
+            Cameras::Two
+        } else {
+            Cameras::Three
+        };
         let (pool, estimator) = estimators.entry(line.clone()).or_insert_with(|| {
             let threads = threads.parse().expect("a number of threads");
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .expect("threads");
             (pool, DepthEstimator::new(DepthSettings::default()))
         });
         let rig = scene.rig(cameras);
         let ms = pool.install(|| {
             let start = Instant::now();
-            estimator.estimate(&rig, &scene.middle_y, &scene.left_y, &scene.right_y, &range, None);
+            estimator.estimate(
+                &rig,
+                &scene.middle_y,
+                &scene.left_y,
+                &scene.right_y,
+                &range,
+                None,
+            );
             start.elapsed().as_secs_f64() * 1e3
         });
         println!("{ms}");

@@ -22,7 +22,13 @@ const NEIGHBOURS: [(isize, isize, usize); 4] = [(0, -1, 1), (0, 1, 0), (-1, 0, 3
 impl Grid {
     fn new(width: usize, height: usize, labels: usize, costs: Vec<i32>) -> Self {
         let received = std::array::from_fn(|_| vec![0; costs.len()]);
-        Self { width, height, labels, costs, received }
+        Self {
+            width,
+            height,
+            labels,
+            costs,
+            received,
+        }
     }
 
     fn at(&self, x: usize, y: usize) -> usize {
@@ -41,7 +47,8 @@ impl Grid {
         for y in 0..self.height {
             for x in 0..self.width {
                 for label in 0..self.labels {
-                    costs[(y / 2 * width + x / 2) * self.labels + label] += self.costs[self.at(x, y) + label];
+                    costs[(y / 2 * width + x / 2) * self.labels + label] +=
+                        self.costs[self.at(x, y) + label];
                 }
             }
         }
@@ -60,17 +67,26 @@ impl Grid {
         }
     }
 
-    fn iterate(&mut self, iteration: usize, smoothness: &dyn Fn((usize, usize), (usize, usize)) -> Smoothness) {
+    fn iterate(
+        &mut self,
+        iteration: usize,
+        smoothness: &dyn Fn((usize, usize), (usize, usize)) -> Smoothness,
+    ) {
         for y in 0..self.height {
             for x in (0..self.width).filter(|x| (x + y) % 2 == iteration % 2) {
                 for k in 0..4 {
-                    let Some(to) = self.neighbour(x, y, k) else { continue };
+                    let Some(to) = self.neighbour(x, y, k) else {
+                        continue;
+                    };
                     let Smoothness { step, truncation } = smoothness((x, y), to);
                     let at = self.at(x, y);
                     let h: Vec<i32> = (0..self.labels)
                         .map(|l| {
                             self.costs[at + l]
-                                + (0..4).filter(|j| *j != k).map(|j| self.received[j][at + l]).sum::<i32>()
+                                + (0..4)
+                                    .filter(|j| *j != k)
+                                    .map(|j| self.received[j][at + l])
+                                    .sum::<i32>()
                         })
                         .collect();
                     let least = *h.iter().min().unwrap();
@@ -80,7 +96,8 @@ impl Grid {
                             .map(|other| h[other] + i32::from(step) * l.abs_diff(other) as i32)
                             .min()
                             .unwrap();
-                        self.received[NEIGHBOURS[k].2][to + l] = near.min(least + i32::from(truncation)) - least;
+                        self.received[NEIGHBOURS[k].2][to + l] =
+                            near.min(least + i32::from(truncation)) - least;
                     }
                 }
             }
@@ -92,8 +109,9 @@ impl Grid {
         pixels
             .map(|(x, y)| {
                 let at = self.at(x, y);
-                let belief =
-                    |l: &usize| self.costs[at + l] + self.received.iter().map(|m| m[at + l]).sum::<i32>();
+                let belief = |l: &usize| {
+                    self.costs[at + l] + self.received.iter().map(|m| m[at + l]).sum::<i32>()
+                };
                 (0..self.labels).min_by_key(belief).unwrap() as u8
             })
             .collect()
@@ -102,7 +120,14 @@ impl Grid {
 
 fn reference(settings: &PropagationSettings, finest: Grid, contrast: &Contrast) -> Vec<u8> {
     let mut levels = vec![finest];
-    while levels.len() < settings.levels && levels.last().unwrap().width.max(levels.last().unwrap().height) > 1 {
+    while levels.len() < settings.levels
+        && levels
+            .last()
+            .unwrap()
+            .width
+            .max(levels.last().unwrap().height)
+            > 1
+    {
         levels.push(levels.last().unwrap().coarser());
     }
     for at in (0..levels.len()).rev() {
@@ -114,7 +139,11 @@ fn reference(settings: &PropagationSettings, finest: Grid, contrast: &Contrast) 
         let width = level.width;
         let smoothness = |a: (usize, usize), b: (usize, usize)| {
             let first = a.min(b);
-            let differ = if a.1 == b.1 { &contrast.right } else { &contrast.below };
+            let differ = if a.1 == b.1 {
+                &contrast.right
+            } else {
+                &contrast.below
+            };
             // The upper or left one of the two; both orders agree, as one coordinate is equal.
             if at == 0 && differ[first.1 * width + first.0] > 0 {
                 settings.across_contrast
@@ -151,10 +180,14 @@ fn random_bytes(seed: u64) -> impl FnMut() -> u8 {
 }
 
 fn smoothness() -> impl Strategy<Value = Smoothness> {
-    (1_u8..=8, 1..=Smoothness::HIGHEST_TRUNCATION).prop_map(|(step, truncation)| Smoothness { step, truncation })
+    (1_u8..=8, 1..=Smoothness::HIGHEST_TRUNCATION)
+        .prop_map(|(step, truncation)| Smoothness { step, truncation })
 }
 
-fn case(width: impl Strategy<Value = usize>, height: impl Strategy<Value = usize>) -> impl Strategy<Value = Case> {
+fn case(
+    width: impl Strategy<Value = usize>,
+    height: impl Strategy<Value = usize>,
+) -> impl Strategy<Value = Case> {
     let settings = (smoothness(), smoothness(), 1..=5_usize, 2..=6_usize).prop_map(
         |(smooth, across_contrast, levels, iterations)| PropagationSettings {
             smooth,
@@ -164,32 +197,56 @@ fn case(width: impl Strategy<Value = usize>, height: impl Strategy<Value = usize
         },
     );
     let highest_cost = prop_oneof![1_u8..40, Just(255)];
-    (width, height, 2..=20_usize, settings, highest_cost, any::<u64>()).prop_map(
-        |(width, height, labels, settings, highest_cost, seed)| Case {
-            width,
-            height,
-            labels,
-            settings,
-            highest_cost,
-            seed,
-        },
+    (
+        width,
+        height,
+        2..=20_usize,
+        settings,
+        highest_cost,
+        any::<u64>(),
     )
+        .prop_map(
+            |(width, height, labels, settings, highest_cost, seed)| Case {
+                width,
+                height,
+                labels,
+                settings,
+                highest_cost,
+                seed,
+            },
+        )
 }
 
 fn believes_as_the_reference(case: &Case) {
-    let Case { width, height, labels, settings, highest_cost, seed } = *case;
+    let Case {
+        width,
+        height,
+        labels,
+        settings,
+        highest_cost,
+        seed,
+    } = *case;
     let mut random = random_bytes(seed);
-    let costs: Vec<u8> =
-        (0..width * height * labels).map(|_| (u16::from(random()) * u16::from(highest_cost) / 255) as u8).collect();
+    let costs: Vec<u8> = (0..width * height * labels)
+        .map(|_| (u16::from(random()) * u16::from(highest_cost) / 255) as u8)
+        .collect();
     let contrast = Contrast {
         right: (0..width * height).map(|_| random() & 1).collect(),
         below: (0..width * height).map(|_| random() & 1).collect(),
     };
-    let finest = Grid::new(width, height, labels, costs.iter().map(|c| i32::from(*c)).collect());
+    let finest = Grid::new(
+        width,
+        height,
+        labels,
+        costs.iter().map(|c| i32::from(*c)).collect(),
+    );
     let expected = reference(&settings, finest, &contrast);
     for isa in Isa::available() {
         for threads in [1, 2, 3] {
-            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let pool = rayon::ThreadPoolBuilder::new()
+                .num_threads(threads)
+                .build()
+                .unwrap();
             let mut propagation = BeliefPropagation::new(settings, width, height, labels, isa);
             // Twice: nothing of a solved problem may leak into the next.
             for round in 0..2 {

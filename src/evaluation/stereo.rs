@@ -2,11 +2,10 @@
 //! (2002) count it.
 
 use crate::{
-    model::{
-        camera::Intrinsics,
-        pose::Pose,
+    model::{camera::Intrinsics, pose::Pose},
+    stages::depth::{
+        DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera,
     },
-    stages::depth::{DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera},
 };
 use std::path::{Path, PathBuf};
 
@@ -24,9 +23,18 @@ pub struct StereoScene {
 #[derive(Debug, thiserror::Error)]
 pub enum StereoError {
     #[error("cannot read {path}: {source}")]
-    Read { path: PathBuf, source: image::ImageError },
-    #[error("{path} has {got:?} pixels but middle.png {expected:?}: all images of a scene have one size")]
-    Size { path: PathBuf, got: (u32, u32), expected: (u32, u32) },
+    Read {
+        path: PathBuf,
+        source: image::ImageError,
+    },
+    #[error(
+        "{path} has {got:?} pixels but middle.png {expected:?}: all images of a scene have one size"
+    )]
+    Size {
+        path: PathBuf,
+        got: (u32, u32),
+        expected: (u32, u32),
+    },
     #[error("{path} knows no disparity: all its pixels are 0")]
     NoTruth { path: PathBuf },
 }
@@ -46,14 +54,28 @@ impl StereoScene {
         let expected = (middle.width(), middle.height());
         let check = |(path, image): (PathBuf, image::DynamicImage)| {
             let got = (image.width(), image.height());
-            if got == expected { Ok((path, image)) } else { Err(StereoError::Size { path, got, expected }) }
+            if got == expected {
+                Ok((path, image))
+            } else {
+                Err(StereoError::Size {
+                    path,
+                    got,
+                    expected,
+                })
+            }
         };
         let (_, left) = check(read("left.png")?)?;
         let (_, right) = check(read("right.png")?)?;
         let (path, truth) = check(read("disparity.png")?)?;
         let disparity: Vec<f32> = match truth {
-            image::DynamicImage::ImageLuma16(truth) => truth.iter().map(|value| f32::from(*value) / 16.0).collect(),
-            truth => truth.to_luma8().iter().map(|value| f32::from(*value) / 16.0).collect(),
+            image::DynamicImage::ImageLuma16(truth) => {
+                truth.iter().map(|value| f32::from(*value) / 16.0).collect()
+            }
+            truth => truth
+                .to_luma8()
+                .iter()
+                .map(|value| f32::from(*value) / 16.0)
+                .collect(),
         };
         if disparity.iter().all(|disparity| *disparity == 0.0) {
             return Err(StereoError::NoTruth { path });
@@ -78,7 +100,10 @@ impl StereoScene {
             cx: self.width as f64 / 2.0,
             cy: self.height as f64 / 2.0,
         };
-        let side = |x: f64| SideCamera { intrinsics, side_from_middle: Pose::translation(x, 0.0, 0.0) };
+        let side = |x: f64| SideCamera {
+            intrinsics,
+            side_from_middle: Pose::translation(x, 0.0, 0.0),
+        };
         DepthRig {
             middle: intrinsics,
             left: (cameras == Cameras::Three).then(|| side(1.0)),
@@ -87,9 +112,21 @@ impl StereoScene {
     }
 
     /// Depth as the pipeline computes it; its inverse depth is the disparity in pixels.
-    pub fn estimate(&self, estimator: &mut DepthEstimator, cameras: Cameras, range: &InverseDepthRange) -> DepthMap {
+    pub fn estimate(
+        &self,
+        estimator: &mut DepthEstimator,
+        cameras: Cameras,
+        range: &InverseDepthRange,
+    ) -> DepthMap {
         estimator
-            .estimate(&self.rig(cameras), &self.middle_y, &self.left_y, &self.right_y, range, None)
+            .estimate(
+                &self.rig(cameras),
+                &self.middle_y,
+                &self.left_y,
+                &self.right_y,
+                range,
+                None,
+            )
             .clone()
     }
 }
@@ -133,7 +170,12 @@ pub struct BadPixels {
 
 /// `disparity` is the dense guess, pixels, `valid` whether it is stood by.
 pub fn bad_pixels(scene: &StereoScene, disparity: &[f32], valid: &[bool]) -> BadPixels {
-    let StereoScene { width, height, disparity: truth, .. } = scene;
+    let StereoScene {
+        width,
+        height,
+        disparity: truth,
+        ..
+    } = scene;
     let discontinuous = near_discontinuities(truth, *width, *height);
     let occluded = half_occluded(truth, *width);
     let known: Vec<usize> = (0..truth.len()).filter(|i| truth[*i] > 0.0).collect();
@@ -143,7 +185,11 @@ pub fn bad_pixels(scene: &StereoScene, disparity: &[f32], valid: &[bool]) -> Bad
         100.0 * of.iter().filter(|i| bad(i)).count() as f64 / of.len().max(1) as f64
     };
     let bad = |i: &usize| error(i) > 1.0;
-    let good: Vec<f64> = known.iter().filter(|i| !bad(i)).map(|i| f64::from(error(i))).collect();
+    let good: Vec<f64> = known
+        .iter()
+        .filter(|i| !bad(i))
+        .map(|i| f64::from(error(i)))
+        .collect();
     BadPixels {
         bad_over_1px: share(&|_| true, &bad),
         bad_over_half_px: share(&|_| true, &|i| error(i) > 0.5),
@@ -168,7 +214,8 @@ fn near_discontinuities(truth: &[f32], width: usize, height: usize) -> Vec<bool>
             if right || below {
                 for y in y.saturating_sub(REACH)..(y + REACH + 1).min(height) {
                     let row = y * width;
-                    near[row + x.saturating_sub(REACH)..row + (x + REACH + 1).min(width)].fill(true);
+                    near[row + x.saturating_sub(REACH)..row + (x + REACH + 1).min(width)]
+                        .fill(true);
                 }
             }
         }
@@ -179,16 +226,19 @@ fn near_discontinuities(truth: &[f32], width: usize, height: usize) -> Vec<bool>
 /// Pixels that the truth hides from the left or the right camera, or puts beyond its image.
 fn half_occluded(truth: &[f32], width: usize) -> Vec<bool> {
     let mut hidden = vec![false; truth.len()];
-    for (truth, hidden) in truth.chunks_exact(width).zip(hidden.chunks_exact_mut(width)) {
+    for (truth, hidden) in truth
+        .chunks_exact(width)
+        .zip(hidden.chunks_exact_mut(width))
+    {
         for sign in [1.0, -1.0] {
             let place = |x: usize| {
                 let place = (x as f32 + sign * truth[x]).round();
                 (place >= 0.0 && place < width as f32).then_some(place as usize)
             };
             let mut nearest = vec![0.0_f32; width];
-            for x in 0..width {
+            for (x, truth) in truth.iter().enumerate() {
                 if let Some(place) = place(x) {
-                    nearest[place] = nearest[place].max(truth[x]);
+                    nearest[place] = nearest[place].max(*truth);
                 }
             }
             for x in (0..width).filter(|x| truth[*x] > 0.0) {
@@ -200,7 +250,12 @@ fn half_occluded(truth: &[f32], width: usize) -> Vec<bool> {
 }
 
 /// Estimates the scene's depth and counts what is wrong. `range` is in pixels of disparity.
-pub fn evaluate(scene: &StereoScene, settings: DepthSettings, cameras: Cameras, range: &InverseDepthRange) -> BadPixels {
+pub fn evaluate(
+    scene: &StereoScene,
+    settings: DepthSettings,
+    cameras: Cameras,
+    range: &InverseDepthRange,
+) -> BadPixels {
     let map = scene.estimate(&mut DepthEstimator::new(settings), cameras, range);
     let valid: Vec<bool> = map.depth_m.iter().map(|depth_m| *depth_m > 0.0).collect();
     bad_pixels(scene, &map.inverse_depth, &valid)

@@ -58,8 +58,18 @@ fn noise(seed: u32, point: Vector3<f64>) -> f64 {
     let mut sum = 0.0;
     for corner in 0..8_u32 {
         let bit = |axis: usize| f64::from((corner >> axis) & 1);
-        let weight: f64 = (0..3).map(|axis| if bit(axis) > 0.0 { part[axis] } else { 1.0 - part[axis] }).product();
-        let cell = (0..3).fold(seed, |hashed, axis| hash(hashed ^ ((floor[axis] + bit(axis)) as i32) as u32));
+        let weight: f64 = (0..3)
+            .map(|axis| {
+                if bit(axis) > 0.0 {
+                    part[axis]
+                } else {
+                    1.0 - part[axis]
+                }
+            })
+            .product();
+        let cell = (0..3).fold(seed, |hashed, axis| {
+            hash(hashed ^ ((floor[axis] + bit(axis)) as i32) as u32)
+        });
         sum += weight * (2.0 * uniform(cell) - 1.0);
     }
     sum
@@ -70,7 +80,10 @@ impl Texture {
         let octaves: f64 = (0..4)
             .map(|octave| {
                 let scale = f64::from(1 << octave);
-                noise(self.seed.wrapping_add(octave), point.coords / self.grain_m * scale) / scale.sqrt()
+                noise(
+                    self.seed.wrapping_add(octave),
+                    point.coords / self.grain_m * scale,
+                ) / scale.sqrt()
             })
             .sum();
         self.mean + self.contrast * octaves.clamp(-1.0, 1.0)
@@ -85,7 +98,8 @@ impl Shape {
             Self::Box(a, b) => {
                 let mut range = (f64::NEG_INFINITY, f64::INFINITY);
                 for axis in 0..3 {
-                    let t = [a[axis], b[axis]].map(|plane| (plane - origin[axis]) / direction[axis]);
+                    let t =
+                        [a[axis], b[axis]].map(|plane| (plane - origin[axis]) / direction[axis]);
                     range = (range.0.max(t[0].min(t[1])), range.1.min(t[0].max(t[1])));
                 }
                 (range.0 <= range.1).then_some(range)?
@@ -104,16 +118,42 @@ impl Shape {
 impl Room {
     /// Walls 5 m away, a floor, boxes and a sphere between 2 and 4 m, one wall nearly without texture.
     pub fn furnished() -> Self {
-        let texture = |seed, mean, contrast, grain_m| Texture { seed, mean, contrast, grain_m };
+        let texture = |seed, mean, contrast, grain_m| Texture {
+            seed,
+            mean,
+            contrast,
+            grain_m,
+        };
         Self {
             things: vec![
-                (Shape::Box([-3.5, -2.5, -1.0], [3.0, 1.0, 5.0]), texture(1, 120.0, 60.0, 0.3)),
-                (Shape::Box([-1.6, -0.3, 3.2], [-0.7, 1.0, 3.9]), texture(11, 80.0, 35.0, 0.15)),
-                (Shape::Box([-0.2, 0.1, 2.5], [0.5, 1.0, 3.0]), texture(21, 150.0, 50.0, 0.1)),
-                (Shape::Box([1.0, -1.2, 3.5], [1.25, 1.0, 3.7]), texture(31, 60.0, 25.0, 0.1)),
-                (Shape::Box([-0.9, -0.9, 4.2], [0.6, -0.5, 4.98]), texture(41, 170.0, 8.0, 0.2)),
-                (Shape::Sphere([0.75, 0.55, 2.3], 0.25), texture(51, 100.0, 45.0, 0.1)),
-                (Shape::Sphere([-0.6, 0.55, 2.2], 0.15), texture(61, 190.0, 40.0, 0.06)),
+                (
+                    Shape::Box([-3.5, -2.5, -1.0], [3.0, 1.0, 5.0]),
+                    texture(1, 120.0, 60.0, 0.3),
+                ),
+                (
+                    Shape::Box([-1.6, -0.3, 3.2], [-0.7, 1.0, 3.9]),
+                    texture(11, 80.0, 35.0, 0.15),
+                ),
+                (
+                    Shape::Box([-0.2, 0.1, 2.5], [0.5, 1.0, 3.0]),
+                    texture(21, 150.0, 50.0, 0.1),
+                ),
+                (
+                    Shape::Box([1.0, -1.2, 3.5], [1.25, 1.0, 3.7]),
+                    texture(31, 60.0, 25.0, 0.1),
+                ),
+                (
+                    Shape::Box([-0.9, -0.9, 4.2], [0.6, -0.5, 4.98]),
+                    texture(41, 170.0, 8.0, 0.2),
+                ),
+                (
+                    Shape::Sphere([0.75, 0.55, 2.3], 0.25),
+                    texture(51, 100.0, 45.0, 0.1),
+                ),
+                (
+                    Shape::Sphere([-0.6, 0.55, 2.2], 0.15),
+                    texture(61, 190.0, 40.0, 0.06),
+                ),
             ],
         }
     }
@@ -123,15 +163,23 @@ impl Room {
         let origin = world_from_camera * Point3::origin();
         // Its optical axis component is 1, so distances along it are depths.
         let direction = world_from_camera * camera.unproject(u, v, 1.0).coords;
-        let hits = self.things.iter().filter_map(|(shape, texture)| Some((shape.hit(&origin, &direction)?, texture)));
-        let (depth_m, texture) = hits.min_by(|a, b| a.0.total_cmp(&b.0)).expect("the room has walls");
+        let hits = self
+            .things
+            .iter()
+            .filter_map(|(shape, texture)| Some((shape.hit(&origin, &direction)?, texture)));
+        let (depth_m, texture) = hits
+            .min_by(|a, b| a.0.total_cmp(&b.0))
+            .expect("the room has walls");
         (depth_m, texture.at(&(origin + direction * depth_m)))
     }
 
     /// Mean light of 3x3 rays a pixel; the depth is that of its centre.
     pub fn render(&self, camera: &Intrinsics, world_from_camera: &Pose, sensor: Sensor) -> View {
         let pixels = camera.width * camera.height;
-        let mut view = View { luminance: Vec::with_capacity(pixels), depth_m: Vec::with_capacity(pixels) };
+        let mut view = View {
+            luminance: Vec::with_capacity(pixels),
+            depth_m: Vec::with_capacity(pixels),
+        };
         for index in 0..pixels {
             let (x, y) = ((index % camera.width) as f64, (index / camera.width) as f64);
             let mut light = 0.0;
@@ -144,7 +192,8 @@ impl Room {
             let noise = sensor.noise * (0..12).map(random).sum::<f64>();
             let value = light * sensor.gain + sensor.offset + noise;
             view.luminance.push(value.round().clamp(0.0, 255.0) as u8);
-            view.depth_m.push(self.look(camera, world_from_camera, x, y).0 as f32);
+            view.depth_m
+                .push(self.look(camera, world_from_camera, x, y).0 as f32);
         }
         view
     }

@@ -88,17 +88,31 @@ pub struct BeliefPropagation {
 }
 
 impl BeliefPropagation {
-    pub fn new(settings: PropagationSettings, width: usize, height: usize, labels: usize, isa: Isa) -> Self {
+    pub fn new(
+        settings: PropagationSettings,
+        width: usize,
+        height: usize,
+        labels: usize,
+        isa: Isa,
+    ) -> Self {
         for Smoothness { truncation, .. } in [settings.smooth, settings.across_contrast] {
-            assert!(truncation <= Smoothness::HIGHEST_TRUNCATION, "sums of messages fit a byte");
+            assert!(
+                truncation <= Smoothness::HIGHEST_TRUNCATION,
+                "sums of messages fit a byte"
+            );
         }
         assert!((1..=PropagationSettings::MOST_LEVELS).contains(&settings.levels));
         assert!(settings.iterations >= 2, "both colours have their turn");
         let mut board = Checkerboard::new(width, height);
         let mut levels = Vec::new();
         loop {
-            let coarsest = levels.len() + 1 == settings.levels || board.width.max(board.height) == 1;
-            let rows = if coarsest { 1 } else { board.height.div_ceil(2) };
+            let coarsest =
+                levels.len() + 1 == settings.levels || board.width.max(board.height) == 1;
+            let rows = if coarsest {
+                1
+            } else {
+                board.height.div_ceil(2)
+            };
             let mut level = Level {
                 costs: CostVolume::new(board.width, board.height, labels),
                 weights: AlignedBytes::zeroed(16 * board.height * board.stride),
@@ -147,21 +161,38 @@ impl BeliefPropagation {
         let boards: Vec<Checkerboard> = coarser.iter().map(|level| level.costs.board).collect();
         // One strip makes one row of the coarsest level, while its rows are in the cache.
         let rows = 1 << coarser.len();
-        let mut strips: Vec<(&mut [u8], Vec<&mut [u8]>)> =
-            finest.bytes.chunks_mut(finest_row * rows).map(|strip| (strip, Vec::new())).collect();
+        let mut strips: Vec<(&mut [u8], Vec<&mut [u8]>)> = finest
+            .bytes
+            .chunks_mut(finest_row * rows)
+            .map(|strip| (strip, Vec::new()))
+            .collect();
         for (depth, level) in coarser.iter_mut().enumerate() {
             let bytes = level.costs.row_bytes() * (rows >> (depth + 1));
             for ((_, levels), chunk) in strips.iter_mut().zip(level.costs.bytes.chunks_mut(bytes)) {
                 levels.push(chunk);
             }
         }
-        let sums = || boards.iter().map(|board| vec![0_u16; labels * board.width]).collect::<Vec<_>>();
+        let sums = || {
+            boards
+                .iter()
+                .map(|board| vec![0_u16; labels * board.width])
+                .collect::<Vec<_>>()
+        };
         strips.par_iter_mut().enumerate().for_each_init(
             || (init(), sums()),
             |(state, sums), (strip, (finest, levels))| {
                 for (row, costs) in finest.chunks_exact_mut(finest_row).enumerate() {
                     let y = strip * rows + row;
-                    fill_row(state, y, &mut CostRow { y, board: &board, labels, bytes: costs });
+                    fill_row(
+                        state,
+                        y,
+                        &mut CostRow {
+                            y,
+                            board: &board,
+                            labels,
+                            bytes: costs,
+                        },
+                    );
                     // Before the costs are cut, so that coarser sums are exact.
                     if let Some(sums) = sums.first_mut() {
                         let (a, b) = costs.split_at(finest_row / 2);
@@ -184,7 +215,14 @@ impl BeliefPropagation {
                         let (sum, rest) = sums[depth..].split_at_mut(1);
                         cut_into(isa, &sum[0], &boards[depth], y, highest, row);
                         if let Some(next) = rest.first_mut() {
-                            sum_pairs(isa, &sum[0], boards[depth].width, next, boards[depth + 1].width, y % 2 == 0);
+                            sum_pairs(
+                                isa,
+                                &sum[0],
+                                boards[depth].width,
+                                next,
+                                boards[depth + 1].width,
+                                y % 2 == 0,
+                            );
                         }
                     }
                 }
@@ -208,20 +246,50 @@ impl BeliefPropagation {
 
     /// All iterations of one level, and then what the next finer one or the caller gets.
     fn propagate(&mut self, at: usize) {
-        let Self { settings, isa, levels, beliefs } = self;
+        let Self {
+            settings,
+            isa,
+            levels,
+            beliefs,
+        } = self;
         let (finer, level) = levels.split_at_mut(at);
-        let Level { costs, weights, first, rings } = &mut level[0];
-        let Checkerboard { width, height, stride, .. } = costs.board;
+        let Level {
+            costs,
+            weights,
+            first,
+            rings,
+        } = &mut level[0];
+        let Checkerboard {
+            width,
+            height,
+            stride,
+            ..
+        } = costs.board;
         // A narrow band would do more rows of its neighbours than of its own.
-        let bands = rayon::current_num_threads().min(height / (4 * (settings.iterations + 1))).max(1);
+        let bands = rayon::current_num_threads()
+            .min(height / (4 * (settings.iterations + 1)))
+            .max(1);
         let rows = height.div_ceil(bands);
         let bands = height.div_ceil(rows);
         // Even, so that each slot keeps its parity, and what nobody sends at the left and right border stays 0.
         let slots = (settings.iterations + 3).next_multiple_of(2);
-        rings.resize_with(bands, || (0..slots).map(|_| AlignedBytes::zeroed(8 * costs.labels * stride)).collect());
-        let walk = Walk { costs, weights, first, iterations: settings.iterations, isa: *isa };
+        rings.resize_with(bands, || {
+            (0..slots)
+                .map(|_| AlignedBytes::zeroed(8 * costs.labels * stride))
+                .collect()
+        });
+        let walk = Walk {
+            costs,
+            weights,
+            first,
+            iterations: settings.iterations,
+            isa: *isa,
+        };
         let outputs: Vec<Output<'_>> = match finer.last_mut() {
-            None => beliefs.chunks_mut(width * rows).map(Output::Beliefs).collect(),
+            None => beliefs
+                .chunks_mut(width * rows)
+                .map(Output::Beliefs)
+                .collect(),
             Some(finer) => {
                 let (labels, stride) = (finer.costs.labels, finer.costs.board.stride);
                 finer
@@ -243,10 +311,27 @@ impl BeliefPropagation {
 }
 
 /// Adds one row of the finest level, both colours, to the row of the next: `[label][x]`.
-fn sum_into(isa: Isa, sums: &mut [u16], width: usize, a: &[u8], b: &[u8], stride: usize, first: bool) {
+fn sum_into(
+    isa: Isa,
+    sums: &mut [u16],
+    width: usize,
+    a: &[u8],
+    b: &[u8],
+    stride: usize,
+    first: bool,
+) {
     #[inline(always)]
-    fn run<V: Lanes>(sums: &mut [u16], width: usize, a: &[u8], b: &[u8], stride: usize, first: bool) {
-        let rows = sums.chunks_exact_mut(width).zip(a.chunks_exact(stride).zip(b.chunks_exact(stride)));
+    fn run<V: Lanes>(
+        sums: &mut [u16],
+        width: usize,
+        a: &[u8],
+        b: &[u8],
+        stride: usize,
+        first: bool,
+    ) {
+        let rows = sums
+            .chunks_exact_mut(width)
+            .zip(a.chunks_exact(stride).zip(b.chunks_exact(stride)));
         for (sums, (a, b)) in rows {
             for (sum, (a, b)) in sums.iter_mut().zip(a.iter().zip(b)) {
                 let pair = u16::from(*a) + u16::from(*b);
@@ -262,10 +347,20 @@ fn sum_into(isa: Isa, sums: &mut [u16], width: usize, a: &[u8], b: &[u8], stride
 }
 
 /// Adds pairs of pixels of one row to the row of the next level.
-fn sum_pairs(isa: Isa, sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool) {
+fn sum_pairs(
+    isa: Isa,
+    sums: &[u16],
+    width: usize,
+    next: &mut [u16],
+    next_width: usize,
+    first: bool,
+) {
     #[inline(always)]
     fn run<V: Lanes>(sums: &[u16], width: usize, next: &mut [u16], next_width: usize, first: bool) {
-        for (sums, next) in sums.chunks_exact(width).zip(next.chunks_exact_mut(next_width)) {
+        for (sums, next) in sums
+            .chunks_exact(width)
+            .zip(next.chunks_exact_mut(next_width))
+        {
             let (pairs, rest) = sums.as_chunks::<2>();
             if first {
                 next.fill(0);
@@ -311,13 +406,15 @@ fn cut_into(isa: Isa, sums: &[u16], board: &Checkerboard, y: usize, highest: u8,
                 for ((cut, sum), least) in cut.iter_mut().zip(sums).zip(&least) {
                     *cut = (sum - least).min(u16::from(highest)) as u8;
                 }
-                let even = &mut even[label * stride + from / 2..][..n.div_ceil(2)];
-                let odd = &mut odd[label * stride + from / 2..][..n / 2];
+                let at = label * stride + from / 2;
+                let even = &mut even[at..at + n.div_ceil(2)];
+                let odd = &mut odd[at..at + n / 2];
+                // As words, which compilers vectorise.
                 for (to, cut) in even.iter_mut().zip(cut.as_chunks::<2>().0) {
-                    *to = cut[0];
+                    *to = u16::from_le_bytes(*cut) as u8;
                 }
                 for (to, cut) in odd.iter_mut().zip(cut.as_chunks::<2>().0) {
-                    *to = cut[1];
+                    *to = (u16::from_le_bytes(*cut) >> 8) as u8;
                 }
             }
         }
@@ -362,43 +459,82 @@ unsafe fn saturate_kernel<V: Lanes>(costs: *mut u8, labels: usize, stride: usize
 impl Level {
     /// Writes the weights of all edges; without contrast all are smooth.
     fn weigh(&mut self, settings: &PropagationSettings, contrast: Option<&Contrast>) {
-        let Checkerboard { width, height, stride, half } = self.costs.board;
+        let Checkerboard {
+            width,
+            height,
+            stride,
+            half,
+        } = self.costs.board;
         if let Some(Contrast { right, below }) = contrast {
-            assert!(right.len() == width * height && below.len() == width * height, "one contrast a pixel");
+            assert!(
+                right.len() == width * height && below.len() == width * height,
+                "one contrast a pixel"
+            );
         }
-        let PropagationSettings { smooth, across_contrast, .. } = *settings;
+        let PropagationSettings {
+            smooth,
+            across_contrast,
+            ..
+        } = *settings;
         let alike = vec![0; width];
         let isa = Isa::detect();
-        self.weights.par_chunks_exact_mut(16 * stride).enumerate().for_each_init(
-            || [(); 4].map(|()| vec![0; 2 * half + 1]),
-            |classes, (y, weights)| {
-                let row = |differs: fn(&Contrast) -> &[u8], y: usize| {
-                    contrast.map_or(&alike[..], |contrast| &differs(contrast)[y * width..][..width])
-                };
-                // Per pixel towards each neighbour: 0 = alike, 1 = not, 2 = there is none.
-                let mut put = |neighbour: usize, first: usize, edges: &[u8]| {
-                    let class = &mut classes[neighbour];
-                    class.fill(NO_EDGE);
-                    for (class, differs) in class[first..].iter_mut().zip(edges) {
-                        *class = u8::from(*differs > 0);
+        self.weights
+            .par_chunks_exact_mut(16 * stride)
+            .enumerate()
+            .for_each_init(
+                || [(); 4].map(|()| vec![0; 2 * half + 1]),
+                |classes, (y, weights)| {
+                    let row = |differs: fn(&Contrast) -> &[u8], y: usize| {
+                        contrast.map_or(&alike[..], |contrast| {
+                            &differs(contrast)[y * width..][..width]
+                        })
+                    };
+                    // Per pixel towards each neighbour: 0 = alike, 1 = not, 2 = there is none.
+                    let mut put = |neighbour: usize, first: usize, edges: &[u8]| {
+                        let class = &mut classes[neighbour];
+                        class.fill(NO_EDGE);
+                        for (class, differs) in class[first..].iter_mut().zip(edges) {
+                            *class = u8::from(*differs > 0);
+                        }
+                    };
+                    put(RIGHT, 0, &row(|contrast| &contrast.right, y)[..width - 1]);
+                    put(LEFT, 1, &row(|contrast| &contrast.right, y)[..width - 1]);
+                    put(
+                        BELOW,
+                        0,
+                        if y + 1 < height {
+                            row(|contrast| &contrast.below, y)
+                        } else {
+                            &[]
+                        },
+                    );
+                    put(
+                        ABOVE,
+                        0,
+                        if y > 0 {
+                            row(|contrast| &contrast.below, y - 1)
+                        } else {
+                            &[]
+                        },
+                    );
+                    for (colour, weights) in weights.chunks_exact_mut(8 * stride).enumerate() {
+                        let parity = Checkerboard::parity(y, colour);
+                        for (neighbour, class) in classes.iter().enumerate() {
+                            let (steps, truncations) =
+                                weights[neighbour * stride..].split_at_mut(4 * stride);
+                            let class = &class[parity..parity + 2 * half];
+                            weigh_edges(
+                                isa,
+                                class,
+                                [smooth.step, across_contrast.step],
+                                &mut steps[..half],
+                            );
+                            let truncation = [smooth.truncation, across_contrast.truncation];
+                            weigh_edges(isa, class, truncation, &mut truncations[..half]);
+                        }
                     }
-                };
-                put(RIGHT, 0, &row(|contrast| &contrast.right, y)[..width - 1]);
-                put(LEFT, 1, &row(|contrast| &contrast.right, y)[..width - 1]);
-                put(BELOW, 0, if y + 1 < height { row(|contrast| &contrast.below, y) } else { &[] });
-                put(ABOVE, 0, if y > 0 { row(|contrast| &contrast.below, y - 1) } else { &[] });
-                for (colour, weights) in weights.chunks_exact_mut(8 * stride).enumerate() {
-                    let parity = Checkerboard::parity(y, colour);
-                    for (neighbour, class) in classes.iter().enumerate() {
-                        let (steps, truncations) = weights[neighbour * stride..].split_at_mut(4 * stride);
-                        let class = &class[parity..parity + 2 * half];
-                        weigh_edges(isa, class, [smooth.step, across_contrast.step], &mut steps[..half]);
-                        let truncation = [smooth.truncation, across_contrast.truncation];
-                        weigh_edges(isa, class, truncation, &mut truncations[..half]);
-                    }
-                }
-            },
-        );
+                },
+            );
     }
 }
 
@@ -451,7 +587,9 @@ impl Walk<'_> {
             for pass in 0..=self.iterations {
                 // What depends on rows that this band has not done is not its own either.
                 let beyond = self.iterations - pass;
-                let Some(y) = front.checked_sub(pass) else { break };
+                let Some(y) = front.checked_sub(pass) else {
+                    break;
+                };
                 if y + beyond < rows.start || y >= (rows.end + beyond).min(height) {
                     continue;
                 }
@@ -497,11 +635,17 @@ impl Walk<'_> {
         let slots = ring.len();
         // Rows outside the image have slots too, whose rows are done or not yet there: nobody reads what they get.
         let near = [(y + slots - 1) % slots, y % slots, (y + 1) % slots];
-        let [above, own, below] = ring.get_disjoint_mut(near).expect("a ring has at least four slots");
+        let [above, own, below] = ring
+            .get_disjoint_mut(near)
+            .expect("a ring has at least four slots");
         let block = own.len() / 2;
         let (colour_0, colour_1) = own.split_at_mut(block);
         let colour = iteration & 1;
-        let (received, row) = if colour == 0 { (colour_0, colour_1) } else { (colour_1, colour_0) };
+        let (received, row) = if colour == 0 {
+            (colour_0, colour_1)
+        } else {
+            (colour_1, colour_0)
+        };
         let received = if iteration == 0 {
             let rows = self.first.len() / block;
             &self.first[(y / 2 % rows) * block..][..block]
@@ -525,11 +669,17 @@ impl Walk<'_> {
                 messages::believe(self.isa, &self.sender(y, 0, colour_0), width, row);
                 messages::believe(self.isa, &self.sender(y, 1, colour_1), width, row);
             }
-            Output::First { first, stride: finer_stride } => {
+            Output::First {
+                first,
+                stride: finer_stride,
+            } => {
                 let bytes = 4 * self.costs.labels * *finer_stride;
                 let to = &mut first[row * bytes..][..bytes];
-                let (even, odd) =
-                    if Checkerboard::parity(y, 0) == 0 { (colour_0, colour_1) } else { (colour_1, colour_0) };
+                let (even, odd) = if Checkerboard::parity(y, 0) == 0 {
+                    (colour_0, colour_1)
+                } else {
+                    (colour_1, colour_0)
+                };
                 interleave(self.isa, even, odd, stride, to, *finer_stride, width);
             }
         }
@@ -538,15 +688,33 @@ impl Walk<'_> {
 
 /// Two half rows of a coarser level, `[..][index]`, into one half row of the finer: each pixel of one colour has its own
 /// 2x2 parent, so its index is the parent's x.
-fn interleave(isa: Isa, even: &[u8], odd: &[u8], coarse_stride: usize, to: &mut [u8], stride: usize, half: usize) {
+fn interleave(
+    isa: Isa,
+    even: &[u8],
+    odd: &[u8],
+    coarse_stride: usize,
+    to: &mut [u8],
+    stride: usize,
+    half: usize,
+) {
     #[inline(always)]
-    fn run<V: Lanes>(even: &[u8], odd: &[u8], coarse_stride: usize, to: &mut [u8], stride: usize, half: usize) {
-        let rows = even.chunks_exact(coarse_stride).zip(odd.chunks_exact(coarse_stride));
+    fn run<V: Lanes>(
+        even: &[u8],
+        odd: &[u8],
+        coarse_stride: usize,
+        to: &mut [u8],
+        stride: usize,
+        half: usize,
+    ) {
+        let rows = even
+            .chunks_exact(coarse_stride)
+            .zip(odd.chunks_exact(coarse_stride));
         for ((even, odd), to) in rows.zip(to.chunks_exact_mut(stride)) {
             // An odd last one takes its pair's other half into the padding.
             let pairs = to[..half.next_multiple_of(2)].as_chunks_mut::<2>().0;
+            // As words, which compilers vectorise.
             for ((to, even), odd) in pairs.iter_mut().zip(even).zip(odd) {
-                *to = [*even, *odd];
+                *to = (u16::from(*even) | u16::from(*odd) << 8).to_le_bytes();
             }
         }
     }

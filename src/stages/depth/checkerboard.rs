@@ -57,7 +57,12 @@ impl Checkerboard {
         let lines = (half + 1).div_ceil(LINE);
         // With an odd number of lines, the labels of one pixel spread over all sets of the cache.
         let stride = (lines | 1) * LINE;
-        Self { width, height, half, stride }
+        Self {
+            width,
+            height,
+            half,
+            stride,
+        }
     }
 
     /// The image whose pixels are 2x2 of this one's; an odd last row or column makes smaller ones.
@@ -74,7 +79,8 @@ impl Checkerboard {
     /// unless the row is shorter than a vector.
     #[inline(always)]
     pub fn vector_starts(half: usize, lanes: usize) -> impl Iterator<Item = usize> {
-        (0..half.div_ceil(lanes)).map(move |vector| (vector * lanes).min(half.saturating_sub(lanes)))
+        (0..half.div_ceil(lanes))
+            .map(move |vector| (vector * lanes).min(half.saturating_sub(lanes)))
     }
 }
 
@@ -90,10 +96,17 @@ pub struct CostVolume {
 impl CostVolume {
     /// All costs zero.
     pub fn new(width: usize, height: usize, labels: usize) -> Self {
-        assert!((2..=256).contains(&labels), "labels are bytes, and one is no choice");
+        assert!(
+            (2..=256).contains(&labels),
+            "labels are bytes, and one is no choice"
+        );
         let board = Checkerboard::new(width, height);
         let bytes = AlignedBytes::zeroed(height * 2 * labels * board.stride);
-        Self { board, labels, bytes }
+        Self {
+            board,
+            labels,
+            bytes,
+        }
     }
 
     pub fn labels(&self) -> usize {

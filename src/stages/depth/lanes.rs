@@ -227,21 +227,21 @@ mod x86 {
 macro_rules! for_each_isa {
     ($(#[$doc:meta])* $vis:vis unsafe fn $name:ident = $kernel:ident($($arg:ident: $ty:ty),* $(,)?)) => {
         $(#[$doc])*
-        #[allow(unused_unsafe, reason = "some kernels are safe code")]
+        #[allow(unused_unsafe, clippy::too_many_arguments, reason = "some kernels are safe code; arguments are passed on")]
         $vis unsafe fn $name(isa: $crate::engine::isa::Isa, $($arg: $ty),*) {
             use $crate::engine::isa::Isa;
             use $crate::stages::depth::lanes;
 
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma,f16c")]
-            #[allow(unused_unsafe, reason = "some kernels are safe code")]
+            #[allow(unused_unsafe, clippy::too_many_arguments, reason = "some kernels are safe code; arguments are passed on")]
             unsafe fn avx2($($arg: $ty),*) {
                 // SAFETY: this function's features are those of the lanes; the rest is the kernel's, passed on.
                 unsafe { $kernel::<lanes::Avx2Lanes>($($arg),*) }
             }
             #[cfg(target_arch = "x86_64")]
             #[target_feature(enable = "avx2,fma,f16c,avx512f,avx512bw,avx512dq,avx512vl")]
-            #[allow(unused_unsafe, reason = "some kernels are safe code")]
+            #[allow(unused_unsafe, clippy::too_many_arguments, reason = "some kernels are safe code; arguments are passed on")]
             unsafe fn avx512($($arg: $ty),*) {
                 // SAFETY: as above.
                 unsafe { $kernel::<lanes::Avx512Lanes>($($arg),*) }

@@ -41,7 +41,12 @@ impl Sender<'_> {
 
     /// A vector must not be longer than the padded row.
     fn isa(&self, isa: Isa) -> Isa {
-        if self.half < 64 { isa.min(Isa::Avx2) } else { isa }.or_best_available()
+        if self.half < 64 {
+            isa.min(Isa::Avx2)
+        } else {
+            isa
+        }
+        .or_best_available()
     }
 }
 
@@ -51,7 +56,13 @@ impl Sender<'_> {
 ///
 /// `row_above`, `row` and `row_below` are the blocks of the other colour, `[neighbour][label][index]`, where the
 /// messages are received.
-pub(super) fn send(isa: Isa, sender: &Sender<'_>, row_above: &mut [u8], row: &mut [u8], row_below: &mut [u8]) {
+pub(super) fn send(
+    isa: Isa,
+    sender: &Sender<'_>,
+    row_above: &mut [u8],
+    row: &mut [u8],
+    row_below: &mut [u8],
+) {
     sender.check();
     let plane = sender.labels * sender.stride;
     assert!(row_above.len() >= 4 * plane && row.len() >= 4 * plane && row_below.len() >= 4 * plane);
@@ -75,9 +86,15 @@ for_each_isa! {
 
 /// # Safety
 /// As [`send`] says.
+#[allow(clippy::needless_range_loop, reason = "four arrays share the index")]
 #[inline(always)]
 unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
-    let Sender { labels, half, stride, .. } = *sender;
+    let Sender {
+        labels,
+        half,
+        stride,
+        ..
+    } = *sender;
     let plane = labels * stride;
     for start in super::checkerboard::Checkerboard::vector_starts(half, V::N) {
         // SAFETY: see `send`.
@@ -85,7 +102,12 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
             let costs = sender.costs.as_ptr().add(start);
             let received = sender.received.as_ptr().add(start);
             let weights = sender.weights.as_ptr().add(start);
-            let sent = [sent[0].add(start), sent[1].add(start), sent[2].add(start), sent[3].add(start)];
+            let sent = [
+                sent[0].add(start),
+                sent[1].add(start),
+                sent[2].add(start),
+                sent[3].add(start),
+            ];
             // Plain loops: a closure would be a function of its own, without the vector instructions.
             let mut step = [V::splat(0); 4];
             let mut truncation = [V::splat(0); 4];
@@ -111,7 +133,9 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
                     from[k] = V::load(received.add(k * plane + at));
                 }
                 // At most 4 d + 1 + 4 d <= 249 for a truncation d <= 31.
-                let sum = V::load(costs.add(at)).add(from[0].add(from[1])).add(from[2].add(from[3]));
+                let sum = V::load(costs.add(at))
+                    .add(from[0].add(from[1]))
+                    .add(from[2].add(from[3]));
                 for k in 0..4 {
                     envelope[k] = sum.sub(from[k]).min(envelope[k].add_saturating(step[k]));
                     least[k] = least[k].min(envelope[k]);
@@ -163,7 +187,13 @@ for_each_isa! {
 /// As [`believe`] says.
 #[inline(always)]
 unsafe fn believe_kernel<V: Lanes>(sender: &Sender<'_>, row: &mut [Belief]) {
-    let Sender { labels, half, stride, parity, .. } = *sender;
+    let Sender {
+        labels,
+        half,
+        stride,
+        parity,
+        ..
+    } = *sender;
     let plane = labels * stride;
     let mut sums = [const { MaybeUninit::<u8>::uninit() }; 256 * 64];
     let sums: *mut u8 = sums.as_mut_ptr().cast();

@@ -40,9 +40,20 @@ pub struct DepthSettings {
 impl Default for DepthSettings {
     fn default() -> Self {
         Self {
-            sweep: SweepSettings { most_difference: 19, occlusion: 6, most_surprise: 3, unseen: 9 },
-            smooth: Smoothness { step: 8, truncation: 13 },
-            across_contrast: Smoothness { step: 6, truncation: 4 },
+            sweep: SweepSettings {
+                most_difference: 19,
+                occlusion: 6,
+                most_surprise: 3,
+                unseen: 9,
+            },
+            smooth: Smoothness {
+                step: 8,
+                truncation: 13,
+            },
+            across_contrast: Smoothness {
+                step: 6,
+                truncation: 4,
+            },
             contrast: 12,
             levels: 5,
             iterations: 5,
@@ -53,7 +64,9 @@ impl Default for DepthSettings {
 impl DepthSettings {
     fn propagation(&self, pixels_per_label: f64) -> PropagationSettings {
         let per_label = |Smoothness { step, truncation }: Smoothness| Smoothness {
-            step: (f64::from(step) * pixels_per_label).round().clamp(1.0, f64::from(truncation.max(1))) as u8,
+            step: (f64::from(step) * pixels_per_label)
+                .round()
+                .clamp(1.0, f64::from(truncation.max(1))) as u8,
             truncation,
         };
         PropagationSettings {
@@ -130,34 +143,60 @@ impl DepthEstimator {
     ) -> &DepthMap {
         let (width, height) = (rig.middle.width, rig.middle.height);
         let pixels = width * height;
-        assert_eq!(middle_y.len(), pixels, "the middle image has its camera's size");
-        assert!(expected_depth_m.is_none_or(|depth_m| depth_m.len() == pixels), "one expected depth a pixel");
+        assert_eq!(
+            middle_y.len(),
+            pixels,
+            "the middle image has its camera's size"
+        );
+        assert!(
+            expected_depth_m.is_none_or(|depth_m| depth_m.len() == pixels),
+            "one expected depth a pixel"
+        );
         let cameras = [(rig.left, left_y), (rig.right, right_y)];
         for (side, (camera, luminance)) in self.sides.iter_mut().zip(cameras) {
             if let Some(camera) = camera {
-                assert_eq!(luminance.len(), camera.intrinsics.pixels(), "a side image has its camera's size");
+                assert_eq!(
+                    luminance.len(),
+                    camera.intrinsics.pixels(),
+                    "a side image has its camera's size"
+                );
                 let exposure = plane_sweep::match_exposure(middle_y, luminance);
                 side.turn(&rig.middle, &camera, range, &exposure, luminance);
             }
         }
         let (isa, settings) = (self.isa, &self.settings);
-        let present = self.sides.iter().zip(cameras).filter(|(_, (camera, _))| camera.is_some());
-        let shifts: Vec<f64> = present.map(|(side, _)| side.pixels_per_label(range)).collect();
+        let present = self
+            .sides
+            .iter()
+            .zip(cameras)
+            .filter(|(_, (camera, _))| camera.is_some());
+        let shifts: Vec<f64> = present
+            .map(|(side, _)| side.pixels_per_label(range))
+            .collect();
         let pixels_per_label = shifts.iter().sum::<f64>() / shifts.len().max(1) as f64;
-        let kind = (width, height, range.labels, settings.propagation(pixels_per_label));
+        let kind = (
+            width,
+            height,
+            range.labels,
+            settings.propagation(pixels_per_label),
+        );
         if self.kind != Some(kind) {
             self.kind = Some(kind);
             self.propagation = None;
         }
-        let propagation = self
-            .propagation
-            .get_or_insert_with(|| BeliefPropagation::new(kind.3, width, height, range.labels, isa));
+        let propagation = self.propagation.get_or_insert_with(|| {
+            BeliefPropagation::new(kind.3, width, height, range.labels, isa)
+        });
         find_contrast(middle_y, width, settings.contrast, &mut self.contrast);
         propagation.set_contrast(&self.contrast);
         let sweep_and_solve = |propagation: &mut BeliefPropagation, sides: &[Side; 2]| {
             let [left, right] = sides;
             let sides = [rig.left.map(|_| left), rig.right.map(|_| right)];
-            let middle = Middle { intrinsics: &rig.middle, luminance: middle_y, expected_depth_m };
+            let middle = Middle {
+                intrinsics: &rig.middle,
+                luminance: middle_y,
+                expected_depth_m,
+            };
             let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
             propagation.fill(
                 settings.sweep.highest_cost(),
@@ -197,14 +236,24 @@ impl DepthEstimator {
             .zip(&mut map.confidence)
             .zip(&mut map.inverse_depth)
             .with_min_len(4096);
-        outputs.zip(beliefs).zip(&map.seen_by).for_each(|((((depth_m, confidence), label), belief), seen_by)| {
-            let inverse_depth = range.far as f32 + *label * range.step() as f32;
-            *label = inverse_depth;
-            let margin = f32::from(belief.rival_cost - belief.cost);
-            *confidence = if *seen_by == 0 { 0.0 } else { (margin / certain).min(1.0) };
-            // Infinitely far is no depth either.
-            *depth_m = if *confidence > 0.0 && inverse_depth > 0.0 { 1.0 / inverse_depth } else { 0.0 };
-        });
+        outputs.zip(beliefs).zip(&map.seen_by).for_each(
+            |((((depth_m, confidence), label), belief), seen_by)| {
+                let inverse_depth = range.far as f32 + *label * range.step() as f32;
+                *label = inverse_depth;
+                let margin = f32::from(belief.rival_cost - belief.cost);
+                *confidence = if *seen_by == 0 {
+                    0.0
+                } else {
+                    (margin / certain).min(1.0)
+                };
+                // Infinitely far is no depth either.
+                *depth_m = if *confidence > 0.0 && inverse_depth > 0.0 {
+                    1.0 / inverse_depth
+                } else {
+                    0.0
+                };
+            },
+        );
         &self.map
     }
 }
@@ -216,7 +265,10 @@ fn find_contrast(luminance: &[u8], width: usize, threshold: u8, contrast: &mut C
     for (to, (a, b)) in right.iter_mut().zip(luminance.iter().zip(&luminance[1..])) {
         *to = u8::from(a.abs_diff(*b) > threshold);
     }
-    for (to, (a, b)) in below.iter_mut().zip(luminance.iter().zip(&luminance[width..])) {
+    for (to, (a, b)) in below
+        .iter_mut()
+        .zip(luminance.iter().zip(&luminance[width..]))
+    {
         *to = u8::from(a.abs_diff(*b) > threshold);
     }
 }

@@ -142,7 +142,13 @@ struct Motion {
 impl Motion {
     fn of(middle: &Intrinsics, side: &SideCamera) -> Self {
         let t = side.side_from_middle.rotation.inverse() * side.side_from_middle.translation.vector;
-        Self { x: middle.fx * t.x, y: middle.fy * t.y, z: t.z, cx: middle.cx, cy: middle.cy }
+        Self {
+            x: middle.fx * t.x,
+            y: middle.fy * t.y,
+            z: t.z,
+            cx: middle.cx,
+            cy: middle.cy,
+        }
     }
 
     /// Scale, and where the pixel (0, 0) comes from.
@@ -199,13 +205,18 @@ impl Side {
             self.luminance = vec![0; width * height];
             self.outside = vec![OUTSIDE; width * height];
             let same_lens = side.intrinsics == *middle;
-            self.look_up = if same_lens && side.side_from_middle.rotation.angle() * middle.fx < 1.0 / 64.0 {
-                Vec::new()
-            } else {
-                look_up(middle, side, width, height, margin, margin_rows)
-            };
+            self.look_up =
+                if same_lens && side.side_from_middle.rotation.angle() * middle.fx < 1.0 / 64.0 {
+                    Vec::new()
+                } else {
+                    look_up(middle, side, width, height, margin, margin_rows)
+                };
             for (outside, look_up) in self.outside.iter_mut().zip(&self.look_up) {
-                *outside = if look_up.index == u32::MAX { OUTSIDE } else { 0 };
+                *outside = if look_up.index == u32::MAX {
+                    OUTSIDE
+                } else {
+                    0
+                };
             }
         }
         if self.look_up.is_empty() {
@@ -225,12 +236,22 @@ impl Side {
             .par_chunks_exact_mut(width)
             .zip(self.look_up.par_chunks_exact(width))
             .for_each(|(row, look_up)| {
-                for (to, LookUp { index, right, below }) in row.iter_mut().zip(look_up) {
+                for (
+                    to,
+                    LookUp {
+                        index,
+                        right,
+                        below,
+                    },
+                ) in row.iter_mut().zip(look_up)
+                {
                     if *index == u32::MAX {
                         continue;
                     }
                     let at = *index as usize;
-                    let pixel = |offset: usize| u32::from(luminance[(at + offset).min(luminance.len() - 1)]);
+                    let pixel = |offset: usize| {
+                        u32::from(luminance[(at + offset).min(luminance.len() - 1)])
+                    };
                     let (right, below) = (u32::from(*right), u32::from(*below));
                     let upper = pixel(0) * (16 - right) + pixel(1) * right;
                     let lower = pixel(stride) * (16 - right) + pixel(stride + 1) * right;
@@ -248,7 +269,11 @@ fn look_up(
     margin: usize,
     margin_rows: usize,
 ) -> Vec<LookUp> {
-    let rotation: Matrix3<f64> = side.side_from_middle.rotation.to_rotation_matrix().into_inner();
+    let rotation: Matrix3<f64> = side
+        .side_from_middle
+        .rotation
+        .to_rotation_matrix()
+        .into_inner();
     let camera = &side.intrinsics;
     let mut table = Vec::with_capacity(width * height);
     for y in 0..height {
@@ -260,7 +285,10 @@ fn look_up(
             );
             table.push(match camera.project(&(rotation * ray).into()) {
                 Some((u, v))
-                    if u >= 0.0 && v >= 0.0 && u <= camera.width as f64 - 1.0 && v <= camera.height as f64 - 1.0 =>
+                    if u >= 0.0
+                        && v >= 0.0
+                        && u <= camera.width as f64 - 1.0
+                        && v <= camera.height as f64 - 1.0 =>
                 {
                     let sixteenths = |value: f64| (value * 16.0).round() as usize;
                     let (u, v) = (sixteenths(u), sixteenths(v));
@@ -270,7 +298,11 @@ fn look_up(
                         below: (v % 16) as u8,
                     }
                 }
-                _ => LookUp { index: u32::MAX, right: 0, below: 0 },
+                _ => LookUp {
+                    index: u32::MAX,
+                    right: 0,
+                    below: 0,
+                },
             });
         }
     }
@@ -295,7 +327,14 @@ impl Strip {
     fn blind(labels: usize, half: usize) -> Self {
         let none = vec![0; half + VECTOR_SLACK];
         let at = vec![[0; 2]; labels];
-        Self { low: none.clone(), high: none, blocker: vec![OUTSIDE; half + VECTOR_SLACK], blocker_at: at.clone(), at, scratch: Vec::new() }
+        Self {
+            low: none.clone(),
+            high: none,
+            blocker: vec![OUTSIDE; half + VECTOR_SLACK],
+            blocker_at: at.clone(),
+            at,
+            scratch: Vec::new(),
+        }
     }
 }
 
@@ -303,9 +342,16 @@ impl Strip {
 enum Sampler<'a> {
     Blind,
     /// All labels shift along the row: `[label]` in 1/8 pixel, `radius` to the interval's ends.
-    Rows { side: &'a Side, eighths: Vec<isize>, radius: isize },
+    Rows {
+        side: &'a Side,
+        eighths: Vec<isize>,
+        radius: isize,
+    },
     /// `[2 * label + 1]` and the two halves beside it: scale and first x, y.
-    Free { side: &'a Side, motions: Vec<(f64, f64, f64)> },
+    Free {
+        side: &'a Side,
+        motions: Vec<(f64, f64, f64)>,
+    },
 }
 
 impl<'a> Sampler<'a> {
@@ -320,12 +366,19 @@ impl<'a> Sampler<'a> {
             let step = (range.step() * side.motion.x).abs();
             return Self::Rows {
                 side,
-                eighths: (0..range.labels).map(|label| eighths(label as f64)).collect(),
-                radius: (step / 2.0 * PHASES as f64).round().clamp(0.0, PHASES as f64 / 2.0) as isize,
+                eighths: (0..range.labels)
+                    .map(|label| eighths(label as f64))
+                    .collect(),
+                radius: (step / 2.0 * PHASES as f64)
+                    .round()
+                    .clamp(0.0, PHASES as f64 / 2.0) as isize,
             };
         }
         let motions = (0..=2 * range.labels)
-            .map(|half_label| side.motion.at(range.inverse_depth((half_label as f64 - 1.0) / 2.0)))
+            .map(|half_label| {
+                side.motion
+                    .at(range.inverse_depth((half_label as f64 - 1.0) / 2.0))
+            })
             .collect();
         Self::Free { side, motions }
     }
@@ -337,7 +390,10 @@ impl<'a> Sampler<'a> {
                 let line = side.width.div_ceil(2) + VECTOR_SLACK;
                 // First pixel and phase of a label, and of its half rows.
                 let place = |eighths: &isize, parity: usize| {
-                    let (pixels, phase) = (eighths.div_euclid(PHASES as isize), eighths.rem_euclid(PHASES as isize));
+                    let (pixels, phase) = (
+                        eighths.div_euclid(PHASES as isize),
+                        eighths.rem_euclid(PHASES as isize),
+                    );
                     let x = (side.margin as isize + pixels) as usize + parity;
                     (x, phase as usize)
                 };
@@ -353,15 +409,22 @@ impl<'a> Sampler<'a> {
                     low: vec![0; 2 * PHASES * line],
                     high: vec![0; 2 * PHASES * line],
                     blocker: vec![OUTSIDE; 4 * line],
-                    at: eighths.iter().map(|eighths| [at(eighths, 0), at(eighths, 1)]).collect(),
-                    blocker_at: eighths.iter().map(|eighths| [blocker_at(eighths, 0), blocker_at(eighths, 1)]).collect(),
+                    at: eighths
+                        .iter()
+                        .map(|eighths| [at(eighths, 0), at(eighths, 1)])
+                        .collect(),
+                    blocker_at: eighths
+                        .iter()
+                        .map(|eighths| [blocker_at(eighths, 0), blocker_at(eighths, 1)])
+                        .collect(),
                     scratch: vec![0; (2 * PHASES + 4) * line],
                 }
             }
             Self::Free { side, motions } => {
                 let line = board.half + VECTOR_SLACK;
-                let at: Vec<_> =
-                    (0..labels).map(|label| [0, 1].map(|parity| (label * 2 + parity) * line)).collect();
+                let at: Vec<_> = (0..labels)
+                    .map(|label| [0, 1].map(|parity| (label * 2 + parity) * line))
+                    .collect();
                 Strip {
                     low: vec![0; labels * 2 * line],
                     high: vec![0; labels * 2 * line],
@@ -399,7 +462,13 @@ for_each_isa! {
 fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip: &mut Strip) {
     let line = row.len().div_ceil(2) + VECTOR_SLACK;
     let n = row.len().div_ceil(2);
-    let Strip { low, high, blocker: blockers, scratch, .. } = strip;
+    let Strip {
+        low,
+        high,
+        blocker: blockers,
+        scratch,
+        ..
+    } = strip;
     let (phases, pixels) = scratch.split_at_mut(2 * PHASES * line);
     let (row_even, rest) = pixels.split_at_mut(line);
     let (row_odd, rest) = rest.split_at_mut(line);
@@ -412,19 +481,24 @@ fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip
         let half = PHASES as u16 / 2;
         let even = &mut phases[phase * line..][..n + 2];
         for i in 0..n {
-            even[1 + i] = ((u16::from(row_even[i]) * w0 + u16::from(row_odd[i]) * w1 + half) / PHASES as u16) as u8;
+            even[1 + i] = ((u16::from(row_even[i]) * w0 + u16::from(row_odd[i]) * w1 + half)
+                / PHASES as u16) as u8;
         }
         (even[0], even[n + 1]) = (even[1], even[n]);
         let odd = &mut phases[(PHASES + phase) * line..][..n + 2];
         for i in 0..n {
-            odd[1 + i] = ((u16::from(row_odd[i]) * w0 + u16::from(row_even[i + 1]) * w1 + half) / PHASES as u16) as u8;
+            odd[1 + i] = ((u16::from(row_odd[i]) * w0 + u16::from(row_even[i + 1]) * w1 + half)
+                / PHASES as u16) as u8;
         }
         (odd[0], odd[n + 1]) = (odd[1], odd[n]);
     }
     for q in 0..2 * PHASES {
         let begin = |eighths: isize| {
             let at = q as isize + eighths;
-            let (pairs, q) = (at.div_euclid(2 * PHASES as isize), at.rem_euclid(2 * PHASES as isize) as usize);
+            let (pairs, q) = (
+                at.div_euclid(2 * PHASES as isize),
+                at.rem_euclid(2 * PHASES as isize) as usize,
+            );
             q * line + (1 + pairs) as usize
         };
         let before = &phases[begin(-radius)..][..n];
@@ -452,9 +526,12 @@ fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip
 #[inline(always)]
 fn part(row: &[u8], even: &mut [u8], odd: &mut [u8]) {
     let (pairs, rest) = row.as_chunks::<2>();
-    for (i, pair) in pairs.iter().enumerate() {
-        even[i] = pair[0];
-        odd[i] = pair[1];
+    // As words, which compilers vectorise.
+    for (even, pair) in even.iter_mut().zip(pairs) {
+        *even = u16::from_le_bytes(*pair) as u8;
+    }
+    for (odd, pair) in odd.iter_mut().zip(pairs) {
+        *odd = (u16::from_le_bytes(*pair) >> 8) as u8;
     }
     let last = row[row.len() - 1];
     even[pairs.len()] = last;
@@ -464,16 +541,44 @@ fn part(row: &[u8], even: &mut [u8], odd: &mut [u8]) {
 }
 
 /// Every label's row sampled by itself, where a hypothesis also shifts rows or scales.
-fn fill_free(isa: Isa, side: &Side, motions: &[(f64, f64, f64)], y: usize, board: &Checkerboard, strip: &mut Strip) {
-    let Strip { low, high, blocker, at, scratch, .. } = strip;
+fn fill_free(
+    isa: Isa,
+    side: &Side,
+    motions: &[(f64, f64, f64)],
+    y: usize,
+    board: &Checkerboard,
+    strip: &mut Strip,
+) {
+    let Strip {
+        low,
+        high,
+        blocker,
+        at,
+        scratch,
+        ..
+    } = strip;
     let (scratch, samples) = scratch.split_at_mut(2 * (side.width + 2));
     let (values, blockers) = samples.split_at_mut(motions.len() * (board.width + 1));
-    let rows = values.chunks_exact_mut(board.width + 1).zip(blockers.chunks_exact_mut(board.width + 1));
+    let rows = values
+        .chunks_exact_mut(board.width + 1)
+        .zip(blockers.chunks_exact_mut(board.width + 1));
     for ((scale, x0, y0), (values, blockers)) in motions.iter().zip(rows) {
         // SAFETY: `isa` is available; the kernel is safe code.
-        unsafe { sample_row(isa, side, (*scale, *x0, *y0), y, board.width, scratch, values, blockers) };
+        unsafe {
+            sample_row(
+                isa,
+                side,
+                (*scale, *x0, *y0),
+                y,
+                board.width,
+                scratch,
+                values,
+                blockers,
+            )
+        };
     }
-    let row = |values: &[u8], half_label: usize, x: usize| values[half_label * (board.width + 1) + x];
+    let row =
+        |values: &[u8], half_label: usize, x: usize| values[half_label * (board.width + 1) + x];
     for (label, at) in at.iter().enumerate() {
         for (parity, at) in at.iter().enumerate() {
             for i in 0..(board.width - parity).div_ceil(2) {
@@ -528,7 +633,10 @@ fn sample_row_kernel<V: Lanes>(
         let sixteenths = (first * 16.0).round() as i64;
         let (pixel, weight) = (sixteenths.div_euclid(16), sixteenths.rem_euclid(16) as u16);
         let pixel = pixel.clamp(0, last + 1 - width as i64) as usize;
-        let (blend, blocked) = (&blend[pixel..pixel + width + 1], &blocked[pixel..pixel + width + 1]);
+        let (blend, blocked) = (
+            &blend[pixel..pixel + width + 1],
+            &blocked[pixel..pixel + width + 1],
+        );
         for ((to, a), b) in values[..width].iter_mut().zip(blend).zip(&blend[1..]) {
             *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + 8) / 16) as u8;
         }
@@ -538,14 +646,21 @@ fn sample_row_kernel<V: Lanes>(
         return;
     }
     // 16.16 fixed point along the row.
-    let (mut position, step) = ((first * 65536.0).round() as i64, (scale * 65536.0).round() as i64);
+    let (mut position, step) = (
+        (first * 65536.0).round() as i64,
+        (scale * 65536.0).round() as i64,
+    );
     for (value, blocker) in values[..width].iter_mut().zip(blockers.iter_mut()) {
         let pixel = position >> 16;
         let at = pixel.clamp(0, last) as usize;
         let weight = ((position >> 12) & 15) as u16;
         let (a, b) = (u16::from(blend[at]), u16::from(blend[at + 1]));
         *value = ((a * (16 - weight) + b * weight + 8) / 16) as u8;
-        *blocker = if pixel == at as i64 { blocked[at].max(blocked[at + 1]) } else { OUTSIDE };
+        *blocker = if pixel == at as i64 {
+            blocked[at].max(blocked[at + 1])
+        } else {
+            OUTSIDE
+        };
         position += step;
     }
 }
@@ -587,8 +702,21 @@ impl<'a> Sweep<'a> {
     ) -> Self {
         let board = Checkerboard::new(middle.intrinsics.width, middle.intrinsics.height);
         let samplers = sides.map(|side| Sampler::new(side, middle.intrinsics, range));
-        let tolerance = sides.iter().flatten().map(|side| side.tolerance(range)).max().unwrap_or(0);
-        Self { isa, settings, middle, range, samplers, tolerance, board }
+        let tolerance = sides
+            .iter()
+            .flatten()
+            .map(|side| side.tolerance(range))
+            .max()
+            .unwrap_or(0);
+        Self {
+            isa,
+            settings,
+            middle,
+            range,
+            samplers,
+            tolerance,
+            board,
+        }
     }
 
     pub fn scratch(&self) -> Scratch {
@@ -602,8 +730,17 @@ impl<'a> Sweep<'a> {
 
     /// Costs of row `y`.
     pub fn fill_row(&self, scratch: &mut Scratch, y: usize, row: &mut CostRow<'_>) {
-        let Self { board, range, middle, .. } = self;
-        let Scratch { strips, luminance, expected } = scratch;
+        let Self {
+            board,
+            range,
+            middle,
+            ..
+        } = self;
+        let Scratch {
+            strips,
+            luminance,
+            expected,
+        } = scratch;
         let labels = range.labels;
         for (sampler, strip) in self.samplers.iter().zip(strips.iter_mut()) {
             sampler.fill(self.isa, y, board, strip);
@@ -612,7 +749,10 @@ impl<'a> Sweep<'a> {
         let colour_bytes = row.bytes.len() / 2;
         for (colour, costs) in row.bytes.chunks_exact_mut(colour_bytes).enumerate() {
             let parity = Checkerboard::parity(y, colour);
-            let here = middle.luminance[pixels.clone()].iter().skip(parity).step_by(2);
+            let here = middle.luminance[pixels.clone()]
+                .iter()
+                .skip(parity)
+                .step_by(2);
             for (to, from) in luminance.iter_mut().zip(here) {
                 *to = *from;
             }
@@ -620,7 +760,10 @@ impl<'a> Sweep<'a> {
                 let here = depth_m[pixels.clone()].iter().skip(parity).step_by(2);
                 for (to, depth_m) in expected.iter_mut().zip(here) {
                     *to = if *depth_m > 0.0 {
-                        range.label_of_depth(f64::from(*depth_m)).round().clamp(0.0, labels as f64 - 1.0) as u8
+                        range
+                            .label_of_depth(f64::from(*depth_m))
+                            .round()
+                            .clamp(0.0, labels as f64 - 1.0) as u8
                     } else {
                         NOT_EXPECTED
                     };
@@ -635,7 +778,11 @@ impl<'a> Sweep<'a> {
                 board,
             };
             half_row.check(labels, costs);
-            let isa = if board.half < 64 { self.isa.min(Isa::Avx2) } else { self.isa };
+            let isa = if board.half < 64 {
+                self.isa.min(Isa::Avx2)
+            } else {
+                self.isa
+            };
             // SAFETY: `isa` is available; `check` has found all slices long enough for vectors that start below
             // `half`, and no vector is longer than a half row or 32.
             unsafe { cost_half_row(isa, self.settings, &half_row, labels, costs) };
@@ -668,7 +815,8 @@ impl HalfRow<'_> {
         assert!(self.luminance.len() >= reach && costs.len() >= labels * self.board.stride);
         assert!(self.expected.is_none_or(|expected| expected.len() >= reach));
         for strip in self.strips {
-            let end = |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
+            let end =
+                |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
             assert!(strip.at.len() == labels && strip.blocker_at.len() == labels);
             assert!(strip.low.len().min(strip.high.len()) >= end(&strip.at));
             assert!(strip.blocker.len() >= end(&strip.blocker_at));
@@ -683,7 +831,12 @@ for_each_isa! {
 /// # Safety
 /// [`HalfRow::check`] has passed.
 #[inline(always)]
-unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, labels: usize, costs: &mut [u8]) {
+unsafe fn cost_kernel<V: Lanes>(
+    settings: &SweepSettings,
+    row: &HalfRow<'_>,
+    labels: usize,
+    costs: &mut [u8],
+) {
     let Checkerboard { half, stride, .. } = *row.board;
     // SAFETY: see `sweep`.
     unsafe {
@@ -702,7 +855,9 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
                     let at = strip.at.get_unchecked(label)[row.parity] + start;
                     let low = V::load(strip.low.as_ptr().add(at));
                     let high = V::load(strip.high.as_ptr().add(at));
-                    let difference = luminance.sub_saturating(high).max(low.sub_saturating(luminance));
+                    let difference = luminance
+                        .sub_saturating(high)
+                        .max(low.sub_saturating(luminance));
                     differences[side] = difference.min(most);
                     let blocker_at = strip.blocker_at.get_unchecked(label)[row.parity] + start;
                     blockers[side] = V::load(strip.blocker.as_ptr().add(blocker_at));
@@ -716,8 +871,12 @@ unsafe fn cost_kernel<V: Lanes>(settings: &SweepSettings, row: &HalfRow<'_>, lab
                 if let Some(expected) = row.expected {
                     let expected = V::load(expected.as_ptr().add(start));
                     let here = V::splat(label as u8);
-                    let away = here.sub_saturating(expected).max(expected.sub_saturating(here)).min(most_surprise);
-                    let away = away.replace_where_less(V::splat(NOT_EXPECTED - 1), expected, V::splat(0));
+                    let away = here
+                        .sub_saturating(expected)
+                        .max(expected.sub_saturating(here))
+                        .min(most_surprise);
+                    let away =
+                        away.replace_where_less(V::splat(NOT_EXPECTED - 1), expected, V::splat(0));
                     cost = cost.add(away);
                 }
                 cost.store(costs.as_mut_ptr().add(label * stride + start));
@@ -747,7 +906,12 @@ pub(super) fn match_exposure(middle: &[u8], side: &[u8]) -> [u8; 256] {
     };
     let (middle, side) = (quantiles(middle), quantiles(side));
     const UNNOTICED: f64 = 2.5;
-    if middle.iter().zip(&side).all(|(m, s)| (m - s).abs() <= UNNOTICED) || side[2] - side[0] < 8.0 {
+    if middle
+        .iter()
+        .zip(&side)
+        .all(|(m, s)| (m - s).abs() <= UNNOTICED)
+        || side[2] - side[0] < 8.0
+    {
         return same;
     }
     let gain = ((middle[2] - middle[0]) / (side[2] - side[0])).clamp(0.5, 2.0);
@@ -795,7 +959,9 @@ impl Side {
     /// How far one label moves the middle of the image, on average.
     pub fn pixels_per_label(&self, range: &InverseDepthRange) -> f64 {
         let (far, near) = (self.motion.at(range.far), self.motion.at(range.near));
-        let centre = |(scale, x, y): (f64, f64, f64)| (scale * self.motion.cx + x, scale * self.motion.cy + y);
+        let centre = |(scale, x, y): (f64, f64, f64)| {
+            (scale * self.motion.cx + x, scale * self.motion.cy + y)
+        };
         let ((x0, y0), (x1, y1)) = (centre(far), centre(near));
         (x1 - x0).hypot(y1 - y0) / (range.labels - 1) as f64
     }
@@ -824,13 +990,19 @@ impl Side {
     ) {
         let placings = self.placings(range);
         let tolerance = self.tolerance(range);
-        let rows = beliefs.chunks_exact(width).zip(seen_by.chunks_exact_mut(width));
+        let rows = beliefs
+            .chunks_exact(width)
+            .zip(seen_by.chunks_exact_mut(width));
         for (y, (beliefs, seen_by)) in rows.enumerate() {
             for (x, (Belief { label, .. }, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
                 let label = usize::from(*label);
                 if let Some(at) = self.place(placings[label], x, y) {
                     let passes = (label + tolerance).min(usize::from(OUTSIDE) - 1);
-                    *seen_by |= if usize::from(self.blocker[at]) <= passes { bit } else { 0 };
+                    *seen_by |= if usize::from(self.blocker[at]) <= passes {
+                        bit
+                    } else {
+                        0
+                    };
                 }
             }
         }
