@@ -67,6 +67,7 @@ impl Grid {
         }
     }
 
+    #[allow(clippy::needless_range_loop, reason = "a direction indexes three tables")]
     fn iterate(
         &mut self,
         iteration: usize,
