@@ -225,7 +225,9 @@ impl Story {
 
     /// Things come and go for ever, as the seed says.
     pub fn patrol(seed: u64) -> Self {
-        let spots: [(f64, f64, &[(&'static str, Kind)]); 4] = [
+        /// Where on the table, and what may stand there.
+        type Spot = (f64, f64, &'static [(&'static str, Kind)]);
+        let spots: [Spot; 4] = [
             (
                 -0.13,
                 -0.13,

@@ -204,16 +204,16 @@ fn encode(
     path: PathBuf,
     write: impl FnOnce(&mut BufWriter<File>) -> image::ImageResult<()>,
 ) -> Result<(), WriteError> {
-    let result = File::create(&path)
-        .map(BufWriter::new)
-        .and_then(|mut file| Ok(write(&mut file).map(|()| file)));
-    match result {
-        Ok(Ok(mut file)) => file
-            .flush()
-            .map_err(|source| WriteError::Io { path, source }),
-        Ok(Err(source)) => Err(WriteError::Encode { path, source }),
-        Err(source) => Err(WriteError::Io { path, source }),
+    let file = match File::create(&path) {
+        Ok(file) => file,
+        Err(source) => return Err(WriteError::Io { path, source }),
+    };
+    let mut file = BufWriter::new(file);
+    if let Err(source) = write(&mut file) {
+        return Err(WriteError::Encode { path, source });
     }
+    file.flush()
+        .map_err(|source| WriteError::Io { path, source })
 }
 
 /// A text file, line by line.

@@ -8,6 +8,8 @@ pub mod rectify;
 
 pub mod localise;
 
+pub mod depth;
+
 pub mod select;
 
 pub mod refine;
