@@ -97,17 +97,19 @@ fn digamma(x: f64) -> f64 {
 }
 
 /// Per channel the parts of the surprise that need no logarithm, and what goes under the shared ones:
-/// `(plain, beta ratio, sigma ratio)`.
+/// `(plain, beta ratio, sigma ratio)`. Beliefs are `(beta, sigma)`; `deviation` is the observation's from tau0.
 #[inline(always)]
 pub fn channel_terms(
     alpha: f32,
-    prior: (f32, f32, f32),
-    posterior: (f32, f32, f32),
+    prior: (f32, f32),
+    posterior: (f32, f32),
+    deviation: f32,
 ) -> (f32, f32, f32) {
-    let (beta0, tau0, sigma0) = prior;
-    let (beta, tau, sigma) = posterior;
+    let (beta0, sigma0) = prior;
+    let (beta, sigma) = posterior;
     let precision = alpha / beta;
-    let moved = tau - tau0;
+    // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
+    let moved = sigma * deviation;
     let plain =
         (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5;
     (plain, beta / beta0, sigma0 / sigma)
@@ -130,16 +132,22 @@ pub fn total(
     sum.max(0.0)
 }
 
-/// The surprise of one pixel whose belief has one appearance.
+/// The surprise of one pixel whose belief has one appearance; `posterior` is the prior's after `observed`.
 #[inline(always)]
-pub fn surprise(prior: &Belief, posterior: &Belief, gamma: &GammaTerm) -> f32 {
+pub fn surprise(
+    prior: &Belief,
+    posterior: &Belief,
+    observed: [f32; CHANNELS],
+    gamma: &GammaTerm,
+) -> f32 {
     let mut plain = 0.0;
     let (mut beta_ratios, mut sigma_ratios) = (1.0, 1.0);
     for c in 0..CHANNELS {
         let (p, b, s) = channel_terms(
             posterior.alpha,
-            (prior.beta[c], prior.tau[c], prior.sigma[c]),
-            (posterior.beta[c], posterior.tau[c], posterior.sigma[c]),
+            (prior.beta[c], prior.sigma[c]),
+            (posterior.beta[c], posterior.sigma[c]),
+            observed[c] - prior.tau[c],
         );
         plain += p;
         beta_ratios *= b;
@@ -176,7 +184,7 @@ pub fn joint_surprise(
     gamma: &GammaTerm,
 ) -> (f32, f32) {
     let earlier = earlier_belief(prior);
-    let surprise2 = surprise(&earlier, &rules.belief(&earlier, observed), gamma);
+    let surprise2 = surprise(&earlier, &rules.belief(&earlier, observed), observed, gamma);
     let (low, high) = EARLIER_SHARE;
     let p2 = prior.p2.clamp(low, high);
     let p1 = 1.0 - p2;

@@ -183,9 +183,16 @@ impl Step {
                 let widened =
                     self.beta[c][lane] + alpha0 * rules.edge_variance_px * self.edge[c][lane];
                 scored.widened_beta[c][lane] = widened;
-                let prior = (widened, self.tau[c][lane], self.sigma[c][lane]);
-                let posterior = rules.update.channel(alpha0, prior, self.observed[c][lane]);
-                let (p, b, s) = channel_terms(rules.update.alpha(alpha0), prior, posterior);
+                let (tau0, sigma0) = (self.tau[c][lane], self.sigma[c][lane]);
+                let observed = self.observed[c][lane];
+                let (beta, _, sigma) =
+                    rules.update.channel(alpha0, (widened, tau0, sigma0), observed);
+                let (p, b, s) = channel_terms(
+                    rules.update.alpha(alpha0),
+                    (widened, sigma0),
+                    (beta, sigma),
+                    observed - tau0,
+                );
                 plain[lane] += p;
                 beta_ratios[lane] *= b;
                 sigma_ratios[lane] *= s;

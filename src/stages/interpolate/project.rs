@@ -297,10 +297,10 @@ impl QuadRow<'_> {
                     pick(plane[2][lane], plane[3][lane]),
                 )
             };
-            let x_low = ceil(corner(&corners.x, min));
-            let y_low = ceil(corner(&corners.y, min));
-            let x_high = floor(corner(&corners.x, max));
-            let y_high = floor(corner(&corners.y, max));
+            let x_low = ceil(corner(&corners.x, min) - EDGE_SLACK);
+            let y_low = ceil(corner(&corners.y, min) - EDGE_SLACK);
+            let x_high = floor(corner(&corners.x, max) + EDGE_SLACK);
+            let y_high = floor(corner(&corners.y, max) + EDGE_SLACK);
             let touches = (triangles[lane] != 0)
                 & (x_high >= 0.0)
                 & (x_low < target.width as f32)
@@ -481,10 +481,10 @@ fn sample_triangle([a, b, c]: [Vertex; 3], x: f32, y: f32) -> (Sample, bool) {
 
 fn draw_triangle(triangle: [Vertex; 3], target: &mut Target) {
     let [a, b, c] = triangle;
-    let x_first = ceil(min(min(a.x, b.x), c.x)).max(0.0);
-    let x_last = floor(max(max(a.x, b.x), c.x)).min(target.width as f32 - 1.0);
-    let y_first = ceil(min(min(a.y, b.y), c.y)).max(target.strip.start as f32);
-    let y_last = floor(max(max(a.y, b.y), c.y)).min(target.strip.end as f32 - 1.0);
+    let x_first = ceil(min(min(a.x, b.x), c.x) - EDGE_SLACK).max(0.0);
+    let x_last = floor(max(max(a.x, b.x), c.x) + EDGE_SLACK).min(target.width as f32 - 1.0);
+    let y_first = ceil(min(min(a.y, b.y), c.y) - EDGE_SLACK).max(target.strip.start as f32);
+    let y_last = floor(max(max(a.y, b.y), c.y) + EDGE_SLACK).min(target.strip.end as f32 - 1.0);
     if x_first > x_last || y_first > y_last {
         return;
     }
@@ -499,6 +499,6 @@ fn draw_triangle(triangle: [Vertex; 3], target: &mut Target) {
     }
 }
 
-/// Of a triangle's weights: rounding in single precision must not open a crack between neighbours. A view drawn from
-/// its own pose has every pixel exactly on a vertex.
+/// Of a triangle's weights and, in pixels, of its bounds: rounding in single precision must not open a crack between
+/// neighbours. A view drawn from its own pose has every pixel exactly on a vertex, those of the border too.
 const EDGE_SLACK: f32 = 1e-3;

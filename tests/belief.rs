@@ -1,0 +1,291 @@
+//! The engine's posterior and surprise are those of the paper, for all that can be believed and observed.
+
+mod reference;
+
+use reference::{Random, isas, joint, pool};
+use surprised::{
+    config::{Preset, Settings},
+    engine::cpu::{CpuEngine, Observation, Score},
+    model::belief::{Belief, CHANNELS, SPREAD_MAX, SPREAD_MIN},
+    stages::{
+        interpolate::prior::{self, Prior},
+        surprise::{GammaTerm, surprise},
+        update::UpdateRules,
+    },
+};
+
+const PRESETS: [Preset; 2] = [Preset::Paper, Preset::Robust];
+
+fn any_belief(random: &mut Random, rules: &UpdateRules) -> Belief {
+    let (low, high) = rules.alpha_range();
+    let spread = (f64::from(SPREAD_MIN), f64::from(SPREAD_MAX));
+    let extreme = |random: &mut Random, low: f64, high: f64| match random.below(8) {
+        0 => low as f32,
+        1 => high as f32,
+        _ => random.log_uniform(low, high) as f32,
+    };
+    Belief {
+        alpha: extreme(random, low.into(), high.into()),
+        beta: std::array::from_fn(|_| extreme(random, spread.0, spread.1)),
+        tau: any_colour(random),
+        sigma: std::array::from_fn(|_| extreme(random, 0.05, 5.0)),
+        tau2: any_colour(random),
+        p2: 0.0,
+    }
+}
+
+fn any_colour(random: &mut Random) -> [f32; CHANNELS] {
+    [
+        random.uniform(0.0, 255.0) as f32,
+        random.uniform(-127.5, 127.5) as f32,
+        random.uniform(-127.5, 127.5) as f32,
+    ]
+}
+
+/// What is expected, close to it, or anything.
+fn any_observation(random: &mut Random, prior: &Belief) -> [f32; CHANNELS] {
+    let reach = match random.below(4) {
+        0 => 0.0,
+        1 => 0.1,
+        2 => 5.0,
+        _ => return any_colour(random),
+    };
+    prior.tau.map(|tau| tau + random.uniform(-reach, reach) as f32)
+}
+
+fn assert_posterior(got: &Belief, expected: &joint::Scored, size: [f32; 3], context: &str) {
+    let near = |got: f32, expected: f64, size: f64| {
+        let error = (f64::from(got) - expected).abs();
+        assert!(error <= 1e-5 * size, "{got} is not {expected}: {context}");
+    };
+    near(got.alpha, expected.alpha, expected.alpha);
+    for c in 0..CHANNELS {
+        near(got.beta[c], expected.beta[c], expected.beta[c]);
+        near(got.sigma[c], expected.sigma[c], expected.sigma[c]);
+        // Of what it is made of: between red and green grey is a small number.
+        near(got.tau[c], expected.tau[c], size[c].into());
+    }
+}
+
+fn assert_surprise(got: f32, expected: f64, context: &str) {
+    let error = (f64::from(got) - expected).abs();
+    assert!(
+        error <= 1e-4 * expected.max(0.01),
+        "{got} nats are not {expected}: {context}"
+    );
+}
+
+#[test]
+fn a_pixel_has_the_papers_posterior_and_surprise() {
+    for preset in PRESETS {
+        for forgetting in [0.5, 0.6, 0.7, 0.8, 0.9] {
+            let settings = Settings {
+                forgetting,
+                edge_error_px: 0.0,
+                ..Settings::preset(preset)
+            };
+            let rules = UpdateRules::new(&settings);
+            let gamma = GammaTerm::new(&rules);
+            let mut random = Random(1);
+            for _ in 0..40_000 {
+                let prior = any_belief(&mut random, &rules);
+                let x = any_observation(&mut random, &prior);
+                let posterior = rules.belief(&prior, x);
+                let one = Settings {
+                    earlier_appearance: false,
+                    ..settings.clone()
+                };
+                let expected = joint::score(&prior, 1.0, [0.0; 3], x.map(f64::from), &one);
+                let context = format!("{preset:?} {prior:?} sees {x:?}");
+                let size = std::array::from_fn(|c| prior.tau[c].abs().max(x[c].abs()));
+                assert_posterior(&posterior, &expected, size, &context);
+                let got = surprise(&prior, &posterior, x, &gamma);
+                assert_surprise(got, expected.surprise, &context);
+                assert!(got >= 0.0);
+            }
+        }
+    }
+}
+
+struct Fabricated {
+    prior: Prior,
+    observation: Observation,
+}
+
+const SIZE: (usize, usize) = (211, 67);
+
+fn fabricated(random: &mut Random, rules: &UpdateRules, smooth: bool) -> Fabricated {
+    let (width, height) = SIZE;
+    let mut prior = Prior::default();
+    prior.resize(width, height);
+    let mut observation = Observation {
+        width,
+        height,
+        ..Observation::default()
+    };
+    let stride = width * prior::PLANES;
+    for y in 0..height {
+        for x in 0..width {
+            let mut belief = any_belief(random, rules);
+            if smooth {
+                let (x, y) = (x as f32, y as f32);
+                belief.tau = [90.0 + 0.5 * x + 0.3 * y, 0.2 * x - 20.0, 10.0 - 0.4 * y];
+            }
+            if random.below(3) == 0 {
+                belief.p2 = random.uniform(0.0, 0.95) as f32;
+            }
+            let observed = if random.below(3) == 0 {
+                belief.tau2
+            } else {
+                any_observation(random, &belief)
+            };
+            let coverage = random.below(8) as f32;
+            let row = &mut prior.data[y * stride..][..stride];
+            prior::put(row, width, x, &belief, 1.0, coverage);
+            for (plane, value) in observation.planes.iter_mut().zip(observed) {
+                plane.push(value);
+            }
+        }
+    }
+    Fabricated { prior, observation }
+}
+
+/// Step 4: mean of the squared one-sided differences in x plus that in y, over neighbours that were seen.
+fn edge(prior: &Prior, x: usize, y: usize, channel: usize) -> f64 {
+    let at = |x: usize, y: usize, plane: usize| f64::from(prior.row(y).plane(plane)[x]);
+    let mut sum = 0.0;
+    for neighbours in [
+        [(x.wrapping_sub(1), y), (x + 1, y)],
+        [(x, y.wrapping_sub(1)), (x, y + 1)],
+    ] {
+        let squares: Vec<f64> = neighbours
+            .into_iter()
+            .filter(|&(nx, ny)| nx < prior.width && ny < prior.height)
+            .filter(|&(nx, ny)| {
+                at(nx, ny, prior::COVERAGE) > 0.0 && at(x, y, prior::COVERAGE) > 0.0
+            })
+            .map(|(nx, ny)| {
+                (at(x, y, prior::TAU + channel) - at(nx, ny, prior::TAU + channel)).powi(2)
+            })
+            .collect();
+        sum += squares.iter().sum::<f64>() / squares.len().max(1) as f64;
+    }
+    sum
+}
+
+/// Half a step of the stored values on top of the error of single precision.
+fn assert_stored(got: &Belief, expected: &joint::Scored, context: &str) {
+    let spread = |got: f32, expected: f64| {
+        let expected = expected.clamp(SPREAD_MIN.into(), SPREAD_MAX.into());
+        let error = (f64::from(got) - expected).abs();
+        let step = 1.0 / 2048.0 + 1e-5;
+        assert!(error <= step * expected, "{got} is not {expected}: {context}");
+    };
+    let level = |got: f32, expected: f64| {
+        let expected = expected.min(f64::from(i16::MAX) / 128.0);
+        let error = (f64::from(got) - expected).abs();
+        assert!(error <= 0.5 / 128.0 + 1e-3, "{got} is not {expected}: {context}");
+    };
+    spread(got.alpha, expected.alpha);
+    for c in 0..CHANNELS {
+        spread(got.beta[c], expected.beta[c]);
+        spread(got.sigma[c], expected.sigma[c]);
+        level(got.tau[c], expected.tau[c]);
+        if expected.p2 > 0.0 {
+            level(got.tau2[c], expected.tau2[c]);
+        }
+    }
+    let error = (f64::from(got.p2) - expected.p2).abs();
+    assert!(error < 1e-3, "p2 {} is not {}: {context}", got.p2, expected.p2);
+}
+
+#[test]
+fn the_engine_scores_an_image_as_the_paper_and_the_robust_steps_say() {
+    let mut exchanged = 0;
+    for preset in PRESETS {
+        for smooth in [false, true] {
+            let settings = Settings {
+                exposure_gain: false,
+                ..Settings::preset(preset)
+            };
+            let rules = UpdateRules::new(&settings);
+            let mut random = Random(7);
+            let Fabricated { prior, observation } = fabricated(&mut random, &rules, smooth);
+            let mut score = Score::default();
+            let engine = CpuEngine::new(&settings, pool(2), isas()[0]);
+            engine.score(&prior, &observation, &mut score);
+            for y in 0..SIZE.1 {
+                for x in 0..SIZE.0 {
+                    let pixel = y * SIZE.0 + x;
+                    let belief = prior.belief(x, y);
+                    let observed: [f32; 3] =
+                        std::array::from_fn(|c| observation.planes[c][pixel]);
+                    let coverage = f64::from(prior.row(y).plane(prior::COVERAGE)[x]);
+                    let expected = joint::score(
+                        &belief,
+                        coverage,
+                        std::array::from_fn(|c| edge(&prior, x, y, c)),
+                        observed.map(f64::from),
+                        &settings,
+                    );
+                    let context = format!("{preset:?} ({x}, {y}) {belief:?} sees {observed:?}");
+                    assert_surprise(score.surprise[pixel], expected.surprise, &context);
+                    // On a threshold either decision is right.
+                    let threshold = f64::from(settings.surprise_threshold);
+                    let decided = (expected.surprise - threshold).abs() > 0.01
+                        && (expected.rho2 - 0.5).abs() > 1e-3
+                        && (expected.p2 - 0.05).abs() > 1e-3;
+                    if decided {
+                        let got = score.posterior[pixel].unpack();
+                        assert_stored(&got, &expected, &context);
+                    }
+                    exchanged += usize::from(expected.rho2 > 0.5);
+                }
+            }
+        }
+    }
+    assert!(exchanged > 1000, "only {exchanged} appearances came back");
+}
+
+#[test]
+fn every_instruction_set_and_number_of_threads_gives_the_same_bits() {
+    for preset in PRESETS {
+        let settings = Settings::preset(preset);
+        let rules = UpdateRules::new(&settings);
+        let Fabricated { prior, observation } = fabricated(&mut Random(3), &rules, true);
+        let mut scores = Vec::new();
+        for isa in isas() {
+            for threads in [1, 3] {
+                let mut score = Score::default();
+                let engine = CpuEngine::new(&settings, pool(threads), isa);
+                engine.score(&prior, &observation, &mut score);
+                let bits: Vec<u32> = score.surprise.iter().map(|s| s.to_bits()).collect();
+                scores.push((bits, score.posterior, score.gain.to_bits()));
+            }
+        }
+        assert!(scores.windows(2).all(|pair| pair[0] == pair[1]), "{preset:?}");
+    }
+}
+
+#[test]
+fn a_belief_that_did_not_change_is_no_surprise() {
+    for forgetting in [0.5f32, 0.6, 0.7, 0.8, 0.9] {
+        let settings = Settings {
+            forgetting,
+            ..Settings::paper()
+        };
+        let rules = UpdateRules::new(&settings);
+        let gamma = GammaTerm::new(&rules);
+        // Where alpha stays what it is.
+        let alpha = 0.5 / (1.0 - forgetting);
+        let mut random = Random(5);
+        for _ in 0..10_000 {
+            let belief = Belief {
+                alpha,
+                ..any_belief(&mut random, &rules)
+            };
+            let got = surprise(&belief, &belief, belief.tau, &gamma);
+            assert!(got < 2e-6, "{got} nats: {belief:?}");
+        }
+    }
+}
