@@ -186,7 +186,9 @@ impl Step {
                 let (tau0, sigma0) = (self.tau[c][lane], self.sigma[c][lane]);
                 let observed = self.observed[c][lane];
                 let (beta, _, sigma) =
-                    rules.update.channel(alpha0, (widened, tau0, sigma0), observed);
+                    rules
+                        .update
+                        .channel(alpha0, (widened, tau0, sigma0), observed);
                 let (p, b, s) = channel_terms(
                     rules.update.alpha(alpha0),
                     (widened, sigma0),

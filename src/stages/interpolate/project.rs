@@ -18,9 +18,9 @@ use crate::stages::lanes::{LANES, Lanes};
 pub type Sample = u64;
 
 /// Steps of u and v per source pixel: half a step times the steepest edge stays below a grey level.
-const STEPS: f32 = 128.0;
-const POSITION_BITS: u32 = 20;
-const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
+pub const STEPS: f32 = 128.0;
+pub const POSITION_BITS: u32 = 20;
+pub const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
 /// The largest width and height that u and v can address.
 pub const SIDE_MAX: usize = 1 << (POSITION_BITS - 7);
 /// Of a positive `f32` the sign is 0 and 7 bits of the mantissa are left out: depth to 1.5e-5 of itself.
@@ -41,10 +41,16 @@ fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
         | steps(u)
 }
 
+/// 1/depth in the target camera, 1/metres.
+#[inline(always)]
+pub fn sample_inverse_depth(sample: Sample) -> f32 {
+    f32::from_bits(((sample >> (2 * POSITION_BITS)) as u32) << INVERSE_DEPTH_SHIFT)
+}
+
 /// Depth in the target camera, metres.
 #[inline(always)]
 pub fn sample_depth_m(sample: Sample) -> f32 {
-    1.0 / f32::from_bits(((sample >> (2 * POSITION_BITS)) as u32) << INVERSE_DEPTH_SHIFT)
+    1.0 / sample_inverse_depth(sample)
 }
 
 /// Whole and fractional source position: `(column, row, right, down)`.
