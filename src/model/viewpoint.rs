@@ -1,5 +1,7 @@
 //! A viewpoint: a stored pose with depth map, mesh and one belief a pixel (the paper's reference parameter image).
 
+use crate::stages::lanes::LANES;
+
 use super::{belief::Record, camera::Intrinsics, frame::Source, pose::Pose};
 
 /// Bits of [`Mesh::cut`]: which of a quad's two triangles exist.
@@ -15,8 +17,10 @@ pub struct Mesh {
     pub depth_m: Vec<f32>,
     /// Triangles of the quad whose upper left vertex is this pixel; rows of `width - 1`.
     pub cut: Vec<u8>,
-    /// Least and greatest depth of each row's vertices; `(inf, 0)` for a row without any.
-    pub row_depth_m: Vec<(f32, f32)>,
+    /// Least and greatest depth of the vertices of sixteen quads of a row, rows of [`Self::blocks`]; `inf` and 0 without
+    /// any.
+    pub block_nearest_m: Vec<f32>,
+    pub block_farthest_m: Vec<f32>,
 }
 
 impl Mesh {
@@ -40,28 +44,42 @@ impl Mesh {
                 mask.push(u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT);
             }
         }
-        let row_depth_m = depth_m
-            .chunks_exact(width)
-            .map(|row| {
-                row.iter()
-                    .filter(|&&z| z > 0.0)
-                    .fold((f32::INFINITY, 0.0f32), |(low, high), &z| {
-                        (low.min(z), high.max(z))
-                    })
-            })
-            .collect();
+        let blocks = width.saturating_sub(1).div_ceil(LANES);
+        let mut block_nearest_m = Vec::with_capacity(blocks * height);
+        let mut block_farthest_m = Vec::with_capacity(blocks * height);
+        for row in depth_m.chunks_exact(width) {
+            for block in 0..blocks {
+                // Quads need the vertex to their right.
+                let vertices = &row[block * LANES..(block * LANES + LANES + 1).min(width)];
+                let (mut low, mut high) = (f32::INFINITY, 0.0f32);
+                for &z in vertices {
+                    let there = if z > 0.0 { z } else { f32::INFINITY };
+                    low = if there < low { there } else { low };
+                    high = if z > high { z } else { high };
+                }
+                block_nearest_m.push(low);
+                block_farthest_m.push(high);
+            }
+        }
         Self {
             intrinsics,
             depth_m,
             cut: mask,
-            row_depth_m,
+            block_nearest_m,
+            block_farthest_m,
         }
+    }
+
+    /// Blocks of sixteen quads in a row.
+    pub fn blocks(&self) -> usize {
+        self.intrinsics.width.saturating_sub(1).div_ceil(LANES)
     }
 
     fn bytes(&self) -> usize {
         size_of_val(self.depth_m.as_slice())
             + size_of_val(self.cut.as_slice())
-            + size_of_val(self.row_depth_m.as_slice())
+            + size_of_val(self.block_nearest_m.as_slice())
+            + size_of_val(self.block_farthest_m.as_slice())
     }
 }
 

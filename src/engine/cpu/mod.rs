@@ -21,9 +21,9 @@ use crate::{
     stages::{
         exposure::exposure_gain,
         interpolate::{
-            merge::{MergeRules, MergeView},
+            merge::{MergeRules, MergeView, VIEWS_MAX},
             prior::{self, Prior},
-            project::Projector,
+            project::{Projector, Reach},
         },
         surprise::GammaTerm,
         update::UpdateRules,
@@ -95,6 +95,8 @@ pub struct CpuEngine {
     exposure_gain: bool,
     /// One a thread; never contended.
     scratch: Vec<Mutex<(StripScratch, ScoreScratch)>>,
+    /// One a view.
+    reaches: Mutex<[Reach; VIEWS_MAX]>,
 }
 
 impl CpuEngine {
@@ -122,6 +124,7 @@ impl CpuEngine {
             },
             exposure_gain: settings.exposure_gain,
             scratch,
+            reaches: Mutex::default(),
         }
     }
 
@@ -133,14 +136,20 @@ impl CpuEngine {
         world_from_camera: &Pose,
         prior: &mut Prior,
     ) {
+        let mut reaches = self
+            .reaches
+            .lock()
+            .expect("never held by a panicked caller");
         let projectors: Vec<Projector> = views
             .iter()
-            .map(|view| {
+            .zip(reaches.iter_mut())
+            .map(|(view, reach)| {
                 Projector::new(
                     &view.viewpoint.mesh,
                     &view.viewpoint.world_from_camera,
                     intrinsics,
                     world_from_camera,
+                    reach,
                 )
             })
             .collect();
