@@ -69,3 +69,25 @@ pub fn reciprocal(x: f32) -> f32 {
     let r = r * (2.0 - x * r);
     r * (2.0 - x * r)
 }
+
+/// A bit mask of the lanes for which something holds.
+#[inline(always)]
+pub fn bits(holds: impl Fn(usize) -> bool) -> u32 {
+    let mut lanes = [0u32; LANES];
+    for (lane, bit) in lanes.iter_mut().enumerate() {
+        *bit = u32::from(holds(lane)) << lane;
+    }
+    lanes.iter().fold(0, |bits, bit| bits | bit)
+}
+
+/// Indices of the set bits, ascending.
+#[inline(always)]
+pub fn members(mut set: u32) -> impl Iterator<Item = usize> {
+    std::iter::from_fn(move || {
+        (set != 0).then(|| {
+            let index = set.trailing_zeros() as usize;
+            set &= set - 1;
+            index
+        })
+    })
+}

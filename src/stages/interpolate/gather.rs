@@ -6,7 +6,7 @@
 
 use crate::{
     model::belief::{LEVEL_SCALE, Record, f32_from_f16},
-    stages::lanes::{LANES, Lanes},
+    stages::lanes::{LANES, Lanes, members},
 };
 
 use super::project::{POSITION_BITS, POSITION_MASK, STEPS, Sample, sample_inverse_depth};
@@ -41,39 +41,36 @@ impl Source {
         inverse_depth: [0.0; LANES],
     };
 
-    /// Of a view of `width * height` pixels, at least 2x2.
+    /// One pixel, of a view of `width * height` pixels, at least 2x2.
     #[inline(always)]
-    pub fn locate(&mut self, samples: &[Sample; LANES], width: usize, height: usize) {
-        let (last_column, last_row) = (width as u32 - 2, height as u32 - 2);
-        let width = width as u32;
-        for lane in 0..LANES {
-            let sample = samples[lane];
-            let u = (sample & POSITION_MASK) as u32;
-            let v = ((sample >> POSITION_BITS) & POSITION_MASK) as u32;
-            // A sample on the last column or row belongs to the quad before it.
-            let column = (u / WHOLE).min(last_column);
-            let row = (v / WHOLE).min(last_row);
-            let right = (u - column * WHOLE).min(WHOLE);
-            let down = (v - row * WHOLE).min(WHOLE);
-            let upper_left = row * width + column;
-            let in_lower_right = right + down > WHOLE;
-            let (corner, w) = if in_lower_right {
-                (
-                    upper_left + width + 1,
-                    [right + down - WHOLE, WHOLE - down, WHOLE - right],
-                )
+    pub fn locate(&mut self, lane: usize, sample: Sample, width: u32, height: u32) {
+        let u = (sample & POSITION_MASK) as u32;
+        let v = ((sample >> POSITION_BITS) & POSITION_MASK) as u32;
+        // A sample on the last column or row belongs to the quad before it.
+        let column = (u / WHOLE).min(width - 2);
+        let row = (v / WHOLE).min(height - 2);
+        let right = (u - column * WHOLE).min(WHOLE);
+        let down = (v - row * WHOLE).min(WHOLE);
+        let upper_left = row * width + column;
+        let in_lower_right = right + down > WHOLE;
+        let corner = upper_left + if in_lower_right { width + 1 } else { 0 };
+        let w = [
+            if in_lower_right {
+                right + down - WHOLE
             } else {
-                (upper_left, [WHOLE - (right + down), right, down])
-            };
-            self.upper_left[lane] = upper_left;
-            self.corner[lane] = corner;
-            self.corner_and_right[lane] = w[0] | (w[1] << 16);
-            self.lower_left[lane] = w[2];
-            for (weights, w) in self.weights.iter_mut().zip(w) {
-                weights[lane] = w as i32 as f32 * (1.0 / STEPS);
-            }
-            self.inverse_depth[lane] = sample_inverse_depth(sample);
+                WHOLE - (right + down)
+            },
+            if in_lower_right { WHOLE - down } else { right },
+            if in_lower_right { WHOLE - right } else { down },
+        ];
+        self.upper_left[lane] = upper_left;
+        self.corner[lane] = corner;
+        self.corner_and_right[lane] = w[0] | (w[1] << 16);
+        self.lower_left[lane] = w[2];
+        for (weights, w) in self.weights.iter_mut().zip(w) {
+            weights[lane] = w as i32 as f32 * (1.0 / STEPS);
         }
+        self.inverse_depth[lane] = sample_inverse_depth(sample);
     }
 
     /// The three records of a lane, in the order of the weights.
@@ -208,18 +205,6 @@ impl Gather for Portable {
     }
 }
 
-/// Indices of the set bits, ascending.
-#[inline(always)]
-pub fn members(mut set: u32) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        (set != 0).then(|| {
-            let index = set.trailing_zeros() as usize;
-            set &= set - 1;
-            index
-        })
-    })
-}
-
 #[cfg(target_arch = "x86_64")]
 pub use x86::Avx;
 
@@ -227,7 +212,9 @@ pub use x86::Avx;
 mod x86 {
     use std::arch::x86_64::*;
 
-    use super::{Gather, GatherView, LANES, Lanes, Source, Sums, Tile, members};
+    use crate::stages::lanes::members;
+
+    use super::{Gather, GatherView, LANES, Lanes, Source, Sums, Tile};
 
     /// With AVX2 and F16C.
     pub struct Avx;

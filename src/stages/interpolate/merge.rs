@@ -7,11 +7,11 @@
 
 use crate::{
     model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
-    stages::lanes::{LANES, Lanes},
+    stages::lanes::{LANES, Lanes, bits, members},
 };
 
 use super::{
-    gather::{Gather, GatherView, LEVEL_UNITS, Source, Sums, members},
+    gather::{Gather, GatherView, LEVEL_UNITS, Source, Sums},
     prior,
     project::Sample,
 };
@@ -127,10 +127,19 @@ pub fn merge_row<G: Gather>(
         let mut step = Step::default();
         for (index, (view, map)) in views.iter().zip(maps).enumerate() {
             if has_triangles(view) {
-                let mut samples = [0; LANES];
-                samples[..count].copy_from_slice(&map[start..start + count]);
-                sources[index].locate(&samples, view.width, view.height);
-                step.see(index, view.weight, &sources[index]);
+                let mut padded = [0; LANES];
+                let samples = match map[start..].first_chunk::<LANES>() {
+                    Some(samples) => samples,
+                    None => {
+                        padded[..count].copy_from_slice(&map[start..start + count]);
+                        &padded
+                    }
+                };
+                let source = &mut sources[index];
+                for lane in 0..LANES {
+                    source.locate(lane, samples[lane], view.width as u32, view.height as u32);
+                    step.see(lane, index, view.weight, source.inverse_depth[lane]);
+                }
             }
         }
         let mut apart = 0;
@@ -195,24 +204,21 @@ struct Step {
 
 impl Step {
     #[inline(always)]
-    fn see(&mut self, index: usize, weight: f32, source: &Source) {
-        for lane in 0..LANES {
-            let inverse_depth = source.inverse_depth[lane];
-            let seen = inverse_depth > 0.0;
-            self.seen[lane] |= u32::from(seen) << index;
-            self.coverage[lane] += if seen { 1.0 } else { 0.0 };
-            self.weight[lane] += if seen { weight } else { 0.0 };
-            self.weighted_depth_m[lane] += if seen { weight / inverse_depth } else { 0.0 };
-            let nearest = self.nearest[lane];
-            self.nearest[lane] = if inverse_depth > nearest {
-                inverse_depth
-            } else {
-                nearest
-            };
-            let farthest = self.farthest[lane];
-            let farther = seen & ((inverse_depth < farthest) | (farthest == 0.0));
-            self.farthest[lane] = if farther { inverse_depth } else { farthest };
-        }
+    fn see(&mut self, lane: usize, index: usize, weight: f32, inverse_depth: f32) {
+        let seen = inverse_depth > 0.0;
+        self.seen[lane] |= u32::from(seen) << index;
+        self.coverage[lane] += if seen { 1.0 } else { 0.0 };
+        self.weight[lane] += if seen { weight } else { 0.0 };
+        self.weighted_depth_m[lane] += if seen { weight / inverse_depth } else { 0.0 };
+        let nearest = self.nearest[lane];
+        self.nearest[lane] = if inverse_depth > nearest {
+            inverse_depth
+        } else {
+            nearest
+        };
+        let farthest = self.farthest[lane];
+        let farther = seen & ((inverse_depth < farthest) | (farthest == 0.0));
+        self.farthest[lane] = if farther { inverse_depth } else { farthest };
     }
 
     /// Pixels, a bit mask, whose views must vote on depth: the farthest is not within the tolerance of the nearest.
@@ -289,16 +295,6 @@ impl Merged {
             }
         }
     }
-}
-
-/// A bit mask of the lanes for which something holds.
-#[inline(always)]
-fn bits(holds: impl Fn(usize) -> bool) -> u32 {
-    let mut lanes = [0u32; LANES];
-    for (lane, bit) in lanes.iter_mut().enumerate() {
-        *bit = u32::from(holds(lane)) << lane;
-    }
-    lanes.iter().fold(0, |bits, bit| bits | bit)
 }
 
 /// Interpolates the three records of a lane's triangle.

@@ -389,15 +389,34 @@ impl QuadRow<'_> {
     #[inline(always)]
     fn draw_block(&self, column: usize, target: &mut Target) {
         let mut triangles = [0u8; LANES];
-        let quads = &self.cut[column..self.cut.len().min(column + LANES)];
-        triangles[..quads.len()].copy_from_slice(quads);
+        match self.cut[column..].first_chunk::<LANES>() {
+            Some(quads) => triangles = *quads,
+            None => {
+                for (triangles, quad) in triangles.iter_mut().zip(&self.cut[column..]) {
+                    *triangles = *quad;
+                }
+            }
+        }
         if u128::from_ne_bytes(triangles) == 0 {
             return;
         }
+        let lanes = |plane: &[f32], column: usize| -> Lanes {
+            *plane[column..]
+                .first_chunk()
+                .expect("rows are padded to whole blocks")
+        };
+        let four = |upper: &[f32], lower: &[f32]| -> [Lanes; 4] {
+            [
+                lanes(upper, column),
+                lanes(upper, column + 1),
+                lanes(lower, column),
+                lanes(lower, column + 1),
+            ]
+        };
         let corners = Corners {
-            x: self.corner_lanes(column, |vertices| &vertices.x),
-            y: self.corner_lanes(column, |vertices| &vertices.y),
-            inverse_depth: self.corner_lanes(column, |vertices| &vertices.inverse_depth),
+            x: four(&self.upper.x, &self.lower.x),
+            y: four(&self.upper.y, &self.lower.y),
+            inverse_depth: four(&self.upper.inverse_depth, &self.lower.inverse_depth),
         };
         let mut block = Block::NONE;
         block.bound(&corners, &triangles, target);
@@ -443,22 +462,6 @@ impl QuadRow<'_> {
                 *slot = (*slot).max(sample);
             }
         }
-    }
-
-    /// Upper left, upper right, lower left, lower right of sixteen quads.
-    #[inline(always)]
-    fn corner_lanes(&self, column: usize, plane: fn(&VertexRow) -> &[f32]) -> [Lanes; 4] {
-        let lanes = |vertices: &VertexRow, column: usize| -> Lanes {
-            *plane(vertices)[column..]
-                .first_chunk()
-                .expect("rows are padded to whole blocks")
-        };
-        [
-            lanes(self.upper, column),
-            lanes(self.upper, column + 1),
-            lanes(self.lower, column),
-            lanes(self.lower, column + 1),
-        ]
     }
 
     /// One quad of any size.
@@ -683,7 +686,11 @@ impl Block {
             // Each triangle lies on its side of the diagonal.
             let side = self.diagonal_x[lane] * dy - self.diagonal_y[lane] * dx;
             let upper_left = side + self.side_bias[lane] >= 0.0;
-            let pick = |of: &[Lanes; 2]| if upper_left { of[0][lane] } else { of[1][lane] };
+            // Both are read before one is taken: a choice of what to read would become a gather.
+            let pick = |of: &[Lanes; 2]| {
+                let (one, other) = (of[0][lane], of[1][lane]);
+                if upper_left { one } else { other }
+            };
             // Barycentric weights on the target image. An edge belongs to both its triangles: no cracks.
             let weight_a = side * pick(&self.inverse_area);
             let weight_left = dx * pick(&self.edge_y) - dy * pick(&self.edge_x);
