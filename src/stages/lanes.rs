@@ -91,3 +91,18 @@ pub fn members(mut set: u32) -> impl Iterator<Item = usize> {
         })
     })
 }
+
+/// Asks for the memory at `index` of a slice, or beyond it, before it is needed; nothing where there is no such
+/// instruction.
+#[inline(always)]
+pub fn prefetch<T>(slice: &[T], index: usize) {
+    let at = slice.as_ptr().wrapping_add(index);
+    #[cfg(target_arch = "x86_64")]
+    {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a prefetch of any address, valid or not, has no effect that can be seen.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(at.cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = at;
+}

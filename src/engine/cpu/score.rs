@@ -7,7 +7,7 @@ use crate::{
     model::belief::{Belief, BeliefLanes, CHANNELS, Record},
     stages::{
         interpolate::prior::{self, Prior, PriorRow},
-        lanes::{LANES, Lanes, bits, members},
+        lanes::{LANES, Lanes, bits, members, prefetch},
         surprise::{GammaTerm, P2_MIN, edge_gradient_row, joint_surprise, plain_terms, total},
         update::UpdateRules,
     },
@@ -126,6 +126,7 @@ fn load(plane: &[f32], start: usize, count: usize) -> Lanes {
 }
 
 /// Sixteen pixels on their way through the update.
+#[derive(Default)]
 struct Step {
     alpha: Lanes,
     beta: [Lanes; CHANNELS],
@@ -155,19 +156,26 @@ impl Step {
         start: usize,
         count: usize,
     ) -> Self {
-        let channels = |plane: usize| -> [Lanes; CHANNELS] {
-            std::array::from_fn(|channel| load(row.plane(plane + channel), start, count))
-        };
-        Self {
+        let mut step = Self {
             alpha: load(row.plane(prior::ALPHA), start, count),
-            beta: channels(prior::BETA),
-            tau: channels(prior::TAU),
-            sigma: channels(prior::SIGMA),
             p2: load(row.plane(prior::P2), start, count),
             coverage: load(row.plane(prior::COVERAGE), start, count),
-            observed: observed.map(|plane| load(plane, start, count).map(|x| x * inverse_gain)),
-            edge: [[0.0; LANES]; CHANNELS],
+            ..Self::default()
+        };
+        for c in 0..CHANNELS {
+            step.beta[c] = load(row.plane(prior::BETA + c), start, count);
+            step.tau[c] = load(row.plane(prior::TAU + c), start, count);
+            step.sigma[c] = load(row.plane(prior::SIGMA + c), start, count);
+            step.observed[c] = load(observed[c], start, count);
+            for observed in &mut step.observed[c] {
+                *observed *= inverse_gain;
+            }
         }
+        for plane in 0..prior::TAU2 {
+            // The next row of the same planes.
+            prefetch(row.data, row.width * (prior::PLANES + plane) + start);
+        }
+        step
     }
 
     #[inline(always)]

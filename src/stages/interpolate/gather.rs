@@ -6,7 +6,7 @@
 
 use crate::{
     model::belief::{LEVEL_SCALE, Record, f32_from_f16},
-    stages::lanes::{LANES, Lanes, members},
+    stages::lanes::{LANES, Lanes, members, prefetch},
 };
 
 use super::project::{POSITION_BITS, POSITION_MASK, STEPS, Sample, sample_inverse_depth};
@@ -71,6 +71,18 @@ impl Source {
             weights[lane] = w as i32 as f32 * (1.0 / STEPS);
         }
         self.inverse_depth[lane] = sample_inverse_depth(sample);
+    }
+
+    /// Asks for what the row below will need: of its three records two are near those of this row.
+    #[inline(always)]
+    pub fn prefetch_below(&self, view: &GatherView) {
+        // Two records are one line of cache.
+        for lane in (0..LANES).step_by(2) {
+            prefetch(
+                view.records,
+                self.upper_left[lane] as usize + 2 * view.width,
+            );
+        }
     }
 
     /// The three records of a lane, in the order of the weights.

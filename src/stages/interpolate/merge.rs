@@ -7,7 +7,7 @@
 
 use crate::{
     model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
-    stages::lanes::{LANES, Lanes, bits, members},
+    stages::lanes::{LANES, Lanes, bits, members, prefetch},
 };
 
 use super::{
@@ -140,6 +140,7 @@ pub fn merge_row<G: Gather>(
                     source.locate(lane, samples[lane], view.width as u32, view.height as u32);
                     step.see(lane, index, view.weight, source.inverse_depth[lane]);
                 }
+                source.prefetch_below(&gather_views[index]);
             }
         }
         let mut apart = 0;
@@ -288,7 +289,10 @@ impl Merged {
     #[inline(always)]
     fn write(&mut self, row: &mut [f32], width: usize, start: usize, count: usize) {
         self.0[prior::P2] = [0.0; LANES];
-        for (plane, lanes) in row.chunks_exact_mut(width).zip(&self.0) {
+        for (index, lanes) in self.0.iter().enumerate() {
+            // The next row of the same planes.
+            prefetch(row, width * (prior::PLANES + index) + start);
+            let plane = &mut row[width * index..][..width];
             match plane[start..].first_chunk_mut() {
                 Some(slot) => *slot = *lanes,
                 None => plane[start..].copy_from_slice(&lanes[..count]),

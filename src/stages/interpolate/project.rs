@@ -400,23 +400,11 @@ impl QuadRow<'_> {
         if u128::from_ne_bytes(triangles) == 0 {
             return;
         }
-        let lanes = |plane: &[f32], column: usize| -> Lanes {
-            *plane[column..]
-                .first_chunk()
-                .expect("rows are padded to whole blocks")
-        };
-        let four = |upper: &[f32], lower: &[f32]| -> [Lanes; 4] {
-            [
-                lanes(upper, column),
-                lanes(upper, column + 1),
-                lanes(lower, column),
-                lanes(lower, column + 1),
-            ]
-        };
+        let (upper, lower) = (self.upper, self.lower);
         let corners = Corners {
-            x: four(&self.upper.x, &self.lower.x),
-            y: four(&self.upper.y, &self.lower.y),
-            inverse_depth: four(&self.upper.inverse_depth, &self.lower.inverse_depth),
+            x: four_corners(&upper.x, &lower.x, column),
+            y: four_corners(&upper.y, &lower.y, column),
+            inverse_depth: four_corners(&upper.inverse_depth, &lower.inverse_depth, column),
         };
         let mut block = Block::NONE;
         block.bound(&corners, &triangles, target);
@@ -502,6 +490,21 @@ struct Corners {
     x: [Lanes; 4],
     y: [Lanes; 4],
     inverse_depth: [Lanes; 4],
+}
+
+/// Upper left, upper right, lower left, lower right of sixteen quads.
+#[inline(always)]
+fn four_corners(upper: &[f32], lower: &[f32], column: usize) -> [Lanes; 4] {
+    let upper = &upper[column..column + LANES + 1];
+    let lower = &lower[column..column + LANES + 1];
+    let mut corners = [[0.0; LANES]; 4];
+    for lane in 0..LANES {
+        corners[0][lane] = upper[lane];
+        corners[1][lane] = upper[lane + 1];
+        corners[2][lane] = lower[lane];
+        corners[3][lane] = lower[lane + 1];
+    }
+    corners
 }
 
 /// Sixteen quads ready to be sampled. Offsets are from the upper right vertex, which both triangles share; `a` is the
@@ -686,10 +689,10 @@ impl Block {
             // Each triangle lies on its side of the diagonal.
             let side = self.diagonal_x[lane] * dy - self.diagonal_y[lane] * dx;
             let upper_left = side + self.side_bias[lane] >= 0.0;
-            // Both are read before one is taken: a choice of what to read would become a gather.
+            let one = if upper_left { u32::MAX } else { 0 };
+            // By bits, because a choice between two places in memory would become a gather.
             let pick = |of: &[Lanes; 2]| {
-                let (one, other) = (of[0][lane], of[1][lane]);
-                if upper_left { one } else { other }
+                f32::from_bits((of[0][lane].to_bits() & one) | (of[1][lane].to_bits() & !one))
             };
             // Barycentric weights on the target image. An edge belongs to both its triangles: no cracks.
             let weight_a = side * pick(&self.inverse_area);
