@@ -59,6 +59,9 @@ pub struct Settings {
     /// How many nearest viewpoints are recalled (section III-D: seven). At most 16: votes are bit masks and the
     /// work grows with it.
     pub views: usize,
+    /// Views farther than this, metres of view distance, are left out beyond the three nearest: where viewpoints are
+    /// sparse the seventh sees another side of things, and edges flash. 1e6 = no limit, as in the paper.
+    pub view_distance_max_m: f64,
     /// Metres of view distance that one radian between viewing directions counts for. Insensitive from 0.3 to 3.
     pub metres_per_radian: f64,
     /// A mesh is cut where depth jumps by more than this share. Insensitive from 2 to 15 %.
@@ -140,6 +143,7 @@ impl Settings {
     pub fn paper() -> Self {
         Self {
             xi: 0.003,
+            view_distance_max_m: 1e6,
             refine_pose: false,
             depth_vote: false,
             colour_vote: false,
@@ -163,6 +167,7 @@ impl Settings {
             sigma_min: 0.05,
             sigma_max: 5.0,
             views: 7,
+            view_distance_max_m: 0.16,
             metres_per_radian: 1.0,
             mesh_cut: 0.05,
             refine_pose: true,
@@ -263,6 +268,7 @@ impl Settings {
         within("sigma_min", self.sigma_min, 1e-3, 100.0)?;
         within("sigma_max", self.sigma_max, self.sigma_min, 1000.0)?;
         within("views", self.views, 1, 16)?;
+        within("view_distance_max_m", self.view_distance_max_m, 0.0, 1e6)?;
         within("metres_per_radian", self.metres_per_radian, 0.0, 100.0)?;
         within("mesh_cut", self.mesh_cut, 1e-3, 1.0)?;
         within("pose_position_sd_m", self.pose_position_sd_m, 0.0, 1.0)?;
@@ -290,6 +296,14 @@ impl Settings {
 pub enum ConfigError {
     #[error("settings: {0}")]
     File(toml::de::Error),
+    #[error("{file}: {error}")]
+    Read { file: String, error: std::io::Error },
+    #[error(
+        "--root {0}: a root is a Zenoh key without wildcards, such as surprised or site/surprised"
+    )]
+    Root(String),
+    #[error("Zenoh: {0}")]
+    Zenoh(String),
     #[error("--set {0}: write it as name=value")]
     Pair(String),
     #[error(

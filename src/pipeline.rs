@@ -171,6 +171,11 @@ impl Pipeline {
         }
     }
 
+    /// Forgets what is known about a camera beside the viewpoints it wrote.
+    pub fn forget(&mut self, source: &Source) {
+        self.cameras.remove(source);
+    }
+
     fn look(&mut self, frame: &Frame) -> Result<Look, FrameError> {
         let depth_m = self.checked_depth(frame)?;
         let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
@@ -286,6 +291,7 @@ impl Pipeline {
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
+            self.settings.view_distance_max_m,
         )
     }
 

@@ -112,8 +112,8 @@ fn without_forgetting_the_update_is_bayes_rule() {
         for _ in 0..20 {
             let mu = prior.tau + random.uniform(-30.0, 30.0);
             let lambda = random.log_uniform(1e-3, 1.0);
-            let ln_likelihood = 0.5 * (lambda / std::f64::consts::TAU).ln()
-                - 0.5 * lambda * (x - mu) * (x - mu);
+            let ln_likelihood =
+                0.5 * (lambda / std::f64::consts::TAU).ln() - 0.5 * lambda * (x - mu) * (x - mu);
             let product = ln_likelihood + prior.ln_density(mu, lambda);
             // (5): proportional, and the factor is the predictive density.
             let expected = posterior.ln_density(mu, lambda) + prior.ln_predictive(x);

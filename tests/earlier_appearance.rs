@@ -122,7 +122,11 @@ fn without_an_earlier_appearance_the_score_is_the_old_one_bit_for_bit() {
         };
         let mut score = Score::default();
         CpuEngine::new(&settings, pool(1), isas()[0]).score(&prior, &observation, &mut score);
-        score.surprise.iter().map(|s| s.to_bits()).collect::<Vec<_>>()
+        score
+            .surprise
+            .iter()
+            .map(|s| s.to_bits())
+            .collect::<Vec<_>>()
     });
     assert_eq!(surprises[0], surprises[1]);
     assert!(surprises[0].iter().any(|&bits| f32::from_bits(bits) > 6.0));

@@ -111,7 +111,12 @@ fn assert_recall_is_true(
         .map(|(camera, pose)| scene.picture(camera, pose).panel)
         .collect();
     let settings = Settings::paper();
-    let prior = recall(&settings, &views.iter().collect::<Vec<_>>(), target, world_from_target);
+    let prior = recall(
+        &settings,
+        &views.iter().collect::<Vec<_>>(),
+        target,
+        world_from_target,
+    );
     let mut counts = [0; 3];
     let mut compared = 0;
     'pixels: for pixel in 0..target.pixels() {
@@ -154,7 +159,10 @@ fn assert_recall_is_true(
             );
         }
         let expected = seen.iter().map(|hit| hit.depth_m).sum::<f64>() / count;
-        assert!((depth_m / expected - 1.0).abs() < 1e-4, "{depth_m} m, not {expected}");
+        assert!(
+            (depth_m / expected - 1.0).abs() < 1e-4,
+            "{depth_m} m, not {expected}"
+        );
     }
     assert!(
         compared * 10 > target.pixels() * 7,
@@ -174,7 +182,10 @@ fn cameras() -> Vec<(Intrinsics, Pose)> {
         ..camera(171, 131)
     };
     vec![
-        (camera(160, 120), pose([-0.25, 0.05, 0.0], [0.02, 0.1, 0.03])),
+        (
+            camera(160, 120),
+            pose([-0.25, 0.05, 0.0], [0.02, 0.1, 0.03]),
+        ),
         (odd, pose([0.2, -0.1, 0.1], [-0.03, -0.08, -0.05])),
         (camera(200, 150), pose([0.0, 0.2, -0.2], [0.1, 0.0, 0.0])),
     ]
@@ -343,7 +354,12 @@ fn a_surface_seen_from_behind_and_a_scene_behind_the_camera_are_unseen() {
 fn nothing_is_known_without_views() {
     let camera = camera(33, 21);
     for preset in [Preset::Paper, Preset::Robust] {
-        let prior = recall(&Settings::preset(preset), &[], &camera, &pose([0.0; 3], [0.0; 3]));
+        let prior = recall(
+            &Settings::preset(preset),
+            &[],
+            &camera,
+            &pose([0.0; 3], [0.0; 3]),
+        );
         for y in 0..21 {
             for x in 0..33 {
                 let belief = prior.belief(x, y);

@@ -20,7 +20,15 @@ struct Views {
 
 /// Smooth surfaces with a step, seen with smooth colours; with `disagreement` some views see another thing in a part.
 fn views(random: &mut Random, disagreement: bool) -> Views {
-    let sizes = [(160, 120), (97, 75), (160, 120), (131, 101), (160, 120), (80, 64), (113, 87)];
+    let sizes = [
+        (160, 120),
+        (97, 75),
+        (160, 120),
+        (131, 101),
+        (160, 120),
+        (80, 64),
+        (113, 87),
+    ];
     let mut weights = Vec::new();
     let viewpoints = sizes
         .into_iter()

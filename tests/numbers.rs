@@ -83,7 +83,8 @@ fn half_floats_round_to_nearest_and_ties_to_even() {
 fn a_record_keeps_a_belief_to_half_a_step_and_clamps_what_it_cannot_hold() {
     let mut random = Random(3);
     for _ in 0..20_000 {
-        let colour = |random: &mut Random| std::array::from_fn(|_| random.uniform(-128.0, 255.0) as f32);
+        let colour =
+            |random: &mut Random| std::array::from_fn(|_| random.uniform(-128.0, 255.0) as f32);
         let belief = Belief {
             alpha: random.uniform(1.0, 5.0) as f32,
             beta: std::array::from_fn(|_| random.log_uniform(1e-6, 1e7) as f32),
@@ -102,10 +103,14 @@ fn a_record_keeps_a_belief_to_half_a_step_and_clamps_what_it_cannot_hold() {
         for c in 0..CHANNELS {
             spread(stored.beta[c], belief.beta[c]);
             spread(stored.sigma[c], belief.sigma[c]);
-            assert!((stored.tau[c] - belief.tau[c]).abs() <= 0.5 / 128.0);
-            assert!((stored.tau2[c] - belief.tau2[c]).abs() <= 0.5 / 128.0);
+            assert!((stored.tau[c] - belief.tau[c]).abs() <= 0.5 / 128.0 + 2e-5);
+            assert!((stored.tau2[c] - belief.tau2[c]).abs() <= 0.5 / 128.0 + 2e-5);
         }
-        assert_eq!(Record::pack(&stored).unpack(), stored, "stored twice is stored once");
+        assert_eq!(
+            Record::pack(&stored).unpack(),
+            stored,
+            "stored twice is stored once"
+        );
     }
     let bright = Belief {
         tau: [400.0, -300.0, 0.0],
@@ -143,7 +148,11 @@ fn the_gamma_terms_are_exact_for_every_forgetting_factor() {
 fn colours_are_transformed_as_jpeg_2000_does_and_back() {
     let mut random = Random(4);
     for _ in 0..100_000 {
-        let rgb = [random.below(256) as u8, random.below(256) as u8, random.below(256) as u8];
+        let rgb = [
+            random.below(256) as u8,
+            random.below(256) as u8,
+            random.below(256) as u8,
+        ];
         let [r, g, b] = rgb.map(f64::from);
         let [y, cb, cr] = ycbcr_from_rgb(rgb.map(f32::from)).map(f64::from);
         // ISO/IEC 15444-1, annex G.3, to the digits of the coefficients.

@@ -25,17 +25,32 @@ fn texture(seed: u64) -> reference::scene::Texture {
             let direction = random.uniform(0.0, std::f64::consts::TAU);
             let k = std::f64::consts::TAU / wavelength_m;
             let phase = random.uniform(0.0, std::f64::consts::TAU);
-            [k * direction.cos(), k * direction.sin(), phase, random.uniform(6.0, 18.0)]
+            [
+                k * direction.cos(),
+                k * direction.sin(),
+                phase,
+                random.uniform(6.0, 18.0),
+            ]
         })
         .collect();
     Box::new(move |a, b| {
-        let y: f64 = waves.iter().map(|[ka, kb, phase, size]| size * (ka * a + kb * b + phase).sin()).sum();
+        let y: f64 = waves
+            .iter()
+            .map(|[ka, kb, phase, size]| size * (ka * a + kb * b + phase).sin())
+            .sum();
         [(125.0 + y).clamp(5.0, 235.0), 0.0, 0.0]
     })
 }
 
-fn panel(seed: u64, center: [f64; 3], yaw_rad: f64, tilt_rad: f64, half_size_m: (f64, f64)) -> Panel {
-    let turn = pose([0.0; 3], [0.0, yaw_rad, 0.0]).rotation * pose([0.0; 3], [tilt_rad, 0.0, 0.0]).rotation;
+fn panel(
+    seed: u64,
+    center: [f64; 3],
+    yaw_rad: f64,
+    tilt_rad: f64,
+    half_size_m: (f64, f64),
+) -> Panel {
+    let turn = pose([0.0; 3], [0.0, yaw_rad, 0.0]).rotation
+        * pose([0.0; 3], [tilt_rad, 0.0, 0.0]).rotation;
     Panel {
         center: Point3::from(Vector3::from(center)),
         right: turn * Vector3::x(),
@@ -180,9 +195,16 @@ fn another_place_is_refused_and_leaves_the_pose_as_it_was() {
     let picture = other.picture(&case.camera, &case.truth);
     let mut random = Random(3);
     let image = observed(&picture, false, &mut random);
-    let noise_image: Vec<f32> = image.iter().map(|_| random.uniform(0.0, 255.0) as f32).collect();
+    let noise_image: Vec<f32> = image
+        .iter()
+        .map(|_| random.uniform(0.0, 255.0) as f32)
+        .collect();
     let flat = vec![120.0; image.len()];
-    for (name, image) in [("another scene", image), ("noise", noise_image), ("a wall", flat)] {
+    for (name, image) in [
+        ("another scene", image),
+        ("noise", noise_image),
+        ("a wall", flat),
+    ] {
         let refined = refine(&case, &image, &case.truth, noise(3.0, 0.3));
         let error = pixel_error(&case, &refined.world_from_camera);
         println!("{name}: {error:.2} px, {refined:?}");
@@ -199,5 +221,8 @@ fn without_views_or_pixels_to_compare_the_pose_is_as_given() {
         views: Vec::new(),
         ..case
     };
-    assert_eq!(refine(&nothing, &image, &given, noise(3.0, 0.3)), Refined::unchanged(given));
+    assert_eq!(
+        refine(&nothing, &image, &given, noise(3.0, 0.3)),
+        Refined::unchanged(given)
+    );
 }

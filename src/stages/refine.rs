@@ -43,6 +43,9 @@ const ITERATIONS: usize = 4;
 const CORRECTION_SD_MAX: f64 = 20.0;
 /// Where a residual stops counting in the test whether refinement helped, predicted standard deviations.
 const RESIDUAL_CAP: f32 = 4.0;
+/// Mean of what counts from which the image shows another scene: half of it fits nothing that is expected. Gain and
+/// offset alone make any two images fit better than before, so improvement is no proof.
+const MISMATCH_MAX: f64 = 2.0;
 /// Fewer comparable pixels on a level say nothing about a pose.
 const PIXELS_MIN: usize = 200;
 /// Expected pose error, pixels of the full image, from which a third and a fourth level are needed to catch it.
@@ -162,8 +165,8 @@ impl PoseRefiner {
                 estimate = next;
             }
             if index == 0 {
-                improved =
-                    self.mismatch(&estimate, level, camera) < self.mismatch(&start, level, camera);
+                let after = self.mismatch(&estimate, level, camera);
+                improved = after < MISMATCH_MAX && after < self.mismatch(&start, level, camera);
             }
         }
         let motion = logarithm(&estimate.given_from_real);

@@ -5,12 +5,17 @@
 
 use crate::model::pose::{Pose, view_distance_m};
 
-/// The `count` poses nearest to `world_from_camera`, nearest first, ties to the earlier index.
+/// So many are recalled however far they are: a robot that comes back on another path has no others.
+const NEAREST_KEPT: usize = 3;
+
+/// The `count` poses nearest to `world_from_camera`, nearest first, ties to the earlier index; of those beyond
+/// `distance_max_m` only the nearest three.
 pub fn select_nearest<'a>(
     world_from_views: impl Iterator<Item = &'a Pose>,
     world_from_camera: &Pose,
     metres_per_radian: f64,
     count: usize,
+    distance_max_m: f64,
 ) -> Vec<usize> {
     let mut nearest: Vec<(f64, usize)> = world_from_views
         .map(|world_from_view| {
@@ -25,5 +30,10 @@ pub fn select_nearest<'a>(
         nearest.truncate(count);
     }
     nearest.sort_unstable_by(by_distance);
-    nearest.into_iter().map(|(_, index)| index).collect()
+    nearest
+        .into_iter()
+        .enumerate()
+        .filter(|(rank, (distance_m, _))| *rank < NEAREST_KEPT || *distance_m <= distance_max_m)
+        .map(|(_, (_, index))| index)
+        .collect()
 }

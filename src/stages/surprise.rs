@@ -135,12 +135,12 @@ pub fn surprise(
     gamma: &GammaTerm,
 ) -> f32 {
     let mut plain = 0.0;
-    for c in 0..CHANNELS {
+    for (c, observed) in observed.into_iter().enumerate() {
         plain += plain_terms(
             posterior.alpha,
             (prior.beta[c], prior.sigma[c]),
             (posterior.beta[c], posterior.sigma[c]),
-            observed[c] - prior.tau[c],
+            observed - prior.tau[c],
         );
     }
     let products = |belief: &Belief| {

@@ -21,9 +21,8 @@ impl NormalGamma {
             tau,
             sigma,
         } = *self;
-        let ln_kappa = alpha * beta.ln()
-            - ln_gamma(alpha)
-            - 0.5 * (2.0 * std::f64::consts::PI * sigma).ln();
+        let ln_kappa =
+            alpha * beta.ln() - ln_gamma(alpha) - 0.5 * (2.0 * std::f64::consts::PI * sigma).ln();
         ln_kappa + (alpha - 0.5) * lambda.ln()
             - beta * lambda
             - lambda * (mu - tau) * (mu - tau) / (2.0 * sigma)

@@ -78,7 +78,8 @@ fn draw(
     let low = corner[0].inf(&corner[1]).inf(&corner[2]);
     let high = corner[0].sup(&corner[1]).sup(&corner[2]);
     let first = |low: f64| (low - 1e-6).ceil().max(0.0) as usize;
-    let end = |high: f64, size: usize| ((high + 1e-6).floor() + 1.0).clamp(0.0, size as f64) as usize;
+    let end =
+        |high: f64, size: usize| ((high + 1e-6).floor() + 1.0).clamp(0.0, size as f64) as usize;
     for v in first(low.y)..end(high.y, target.height) {
         for u in first(low.x)..end(high.x, target.width) {
             let pixel = Vector2::new(u as f64, v as f64);
@@ -165,7 +166,10 @@ pub fn merge(
                     .map(|&b| weight(b) * distance(&seen[a].0.tau, &seen[b].0.tau).min(80.0))
                     .sum()
             };
-            let medoid = kept.iter().copied().min_by(|&a, &b| cost(a).total_cmp(&cost(b)));
+            let medoid = kept
+                .iter()
+                .copied()
+                .min_by(|&a, &b| cost(a).total_cmp(&cost(b)));
             let medoid = seen[medoid.expect("some view is kept")].0.tau;
             kept.retain(|&i| distance(&seen[i].0.tau, &medoid) <= 40.0);
         }
@@ -173,7 +177,10 @@ pub fn merge(
     // Step 2c.
     let total: f64 = kept.iter().map(|&i| weight(i)).sum();
     let mean = |value: &dyn Fn(&Interpolated) -> f64| -> f64 {
-        kept.iter().map(|&i| weight(i) * value(&seen[i].0)).sum::<f64>() / total
+        kept.iter()
+            .map(|&i| weight(i) * value(&seen[i].0))
+            .sum::<f64>()
+            / total
     };
     let mut belief = Interpolated {
         alpha: mean(&|b| b.alpha),
@@ -201,7 +208,10 @@ pub fn merge(
                 all += w;
             }
         }
-        let heaviest = candidates.iter().copied().max_by(|a, b| a.1.total_cmp(&b.1));
+        let heaviest = candidates
+            .iter()
+            .copied()
+            .max_by(|a, b| a.1.total_cmp(&b.1));
         let heaviest = heaviest.expect("the kept are candidates");
         if heaviest.1 > 0.0 {
             candidates.retain(|(tau, _)| distance(tau, &heaviest.0) <= 40.0);

@@ -83,8 +83,12 @@ impl Scene {
             for u in 0..camera.width {
                 let hits = self.hits(camera, world_from_camera, u as f64, v as f64);
                 let hit = hits.first();
-                picture.depth_m.push(hit.map_or(0.0, |hit| hit.depth_m as f32));
-                picture.colour.push(hit.map_or([0.0; CHANNELS], |hit| hit.colour));
+                picture
+                    .depth_m
+                    .push(hit.map_or(0.0, |hit| hit.depth_m as f32));
+                picture
+                    .colour
+                    .push(hit.map_or([0.0; CHANNELS], |hit| hit.colour));
                 picture.panel.push(hit.map(|hit| hit.panel));
             }
         }
