@@ -58,6 +58,7 @@ impl Case {
         let settings = Settings {
             views,
             viewpoints: views,
+            view_distance_max_m: 1e6,
             grow_distance_m: if preset == Preset::Paper { 0.0 } else { 0.01 },
             ..Settings::preset(preset)
         };

@@ -41,6 +41,7 @@ impl Mesh {
     }
 
     /// Makes everything that follows from intrinsics and depth; memory that is there is used again.
+    #[inline(always)]
     pub fn join(&mut self, cut: f32) {
         let Intrinsics { width, height, .. } = self.intrinsics;
         assert_eq!(self.depth_m.len(), width * height, "one depth a pixel");
@@ -125,6 +126,7 @@ impl Coarse {
     }
 
     /// The same, using again the memory that is there.
+    #[inline(always)]
     pub fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: f32) {
         let fine = mesh.intrinsics;
         let coarse = fine.half();
@@ -155,6 +157,7 @@ impl Coarse {
 }
 
 /// Means of the depths that are there; 0 where they are too few or not on one surface.
+#[inline(always)]
 fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: f32, coarse: &mut [f32]) {
     let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
     for (coarse, (upper, lower)) in coarse.iter_mut().zip(pairs) {
@@ -170,6 +173,7 @@ fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: f32, coarse: &mut [f32]) 
     }
 }
 
+#[inline(always)]
 fn coarse_luminance_row(
     upper: &[Record],
     lower: &[Record],
