@@ -3,16 +3,16 @@
 
 use std::{collections::HashMap, sync::Arc};
 
+use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
-    engine::{
-        cpu::{CpuEngine, Observation, RecallView, Score},
-        isa::Isa,
-    },
+    engine::cpu::{CpuEngine, Observation, RecallView, Score},
+    isa::Isa,
     memory::{Memory, visit::Visit},
     model::{
+        belief::Record,
         camera::Intrinsics,
         frame::{Frame, FrameError, Source},
         pose::{Pose, PoseNoise},
@@ -21,9 +21,12 @@ use crate::{
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
-        interpolate::prior::{self, Prior},
+        interpolate::{
+            merge::VIEWS_MAX,
+            prior::{self, Prior},
+        },
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
-        select::select_nearest,
+        select::select_into,
     },
 };
 
@@ -57,13 +60,17 @@ struct Camera {
     follower: Follower,
 }
 
-/// A frame compared with what was expected; nothing is learnt yet.
-struct Look {
-    world_from_camera: Pose,
-    selected: Vec<usize>,
+/// Working memory between frames: what was overwritten is filled again.
+#[derive(Default)]
+struct Workspace {
+    /// Checked, metres.
     depth_m: Vec<f32>,
-    camera: Camera,
-    report: Report,
+    observation: Observation,
+    selected: Vec<usize>,
+    blocks: BlockMap,
+    mesh: Mesh,
+    records: Vec<Record>,
+    coarse: Coarse,
 }
 
 pub struct Pipeline {
@@ -74,6 +81,7 @@ pub struct Pipeline {
     cameras: HashMap<Source, Camera>,
     last_region_id: u64,
     maps: Maps,
+    workspace: Workspace,
 }
 
 impl Pipeline {
@@ -91,6 +99,7 @@ impl Pipeline {
             cameras: HashMap::new(),
             last_region_id: 0,
             maps: Maps::default(),
+            workspace: Workspace::default(),
             settings,
         }
     }
@@ -113,20 +122,45 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        let Look {
-            world_from_camera,
-            selected,
-            depth_m,
-            mut camera,
-            mut report,
-        } = self.look(frame)?;
-        let records = self.maps.score.posterior.clone();
-        let mesh = Mesh::new(frame.intrinsics, depth_m, self.settings.mesh_cut);
+        self.check(frame)?;
+        let mut camera = match self.cameras.get_mut(&frame.source) {
+            Some(camera) => std::mem::take(camera),
+            None => Camera::default(),
+        };
+        let mut report = self.look(frame, &mut camera.visit);
+        let id = self.remember(frame, &report.world_from_camera);
+        camera.visit.wrote(id);
+        camera
+            .follower
+            .follow(&mut report.regions, &mut self.last_region_id);
+        match self.cameras.get_mut(&frame.source) {
+            Some(slot) => *slot = camera,
+            None => {
+                self.cameras.insert(frame.source.clone(), camera);
+            }
+        }
+        report.learned = true;
+        report.viewpoint_id = Some(id);
+        Ok(report)
+    }
+
+    /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
+    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose) -> u64 {
+        let work = &mut self.workspace;
+        let mut mesh = std::mem::take(&mut work.mesh);
+        let mut coarse = std::mem::take(&mut work.coarse);
+        let mut records = std::mem::take(&mut work.records);
+        mesh.intrinsics = frame.intrinsics;
+        std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
+        records.clear();
+        records.extend_from_slice(&self.maps.score.posterior);
+        self.engine
+            .prepare(&mut mesh, &records, &mut coarse, self.settings.mesh_cut);
         let viewpoint = Viewpoint {
-            coarse: Coarse::new(&mesh, &records, self.settings.mesh_cut),
+            coarse,
             id: 0,
-            world_from_camera,
-            world_from_home: world_from_camera,
+            world_from_camera: *world_from_camera,
+            world_from_home: *world_from_camera,
             mesh,
             records,
             source: frame.source.clone(),
@@ -134,20 +168,18 @@ impl Pipeline {
             updates: 0,
         };
         let slot = self.memory.slot(
-            &selected,
-            &world_from_camera,
+            &work.selected,
+            world_from_camera,
             viewpoint.bytes(),
             &self.settings,
         );
-        let id = self.memory.write(slot, viewpoint);
-        camera.visit.wrote(id);
-        camera
-            .follower
-            .follow(&mut report.regions, &mut self.last_region_id);
-        self.cameras.insert(frame.source.clone(), camera);
-        report.learned = true;
-        report.viewpoint_id = Some(id);
-        Ok(report)
+        let (id, old) = self.memory.replace(slot, viewpoint);
+        if let Some(old) = old {
+            work.mesh = old.mesh;
+            work.coarse = old.coarse;
+            work.records = old.records;
+        }
+        id
     }
 
     /// Compares a frame with the memory and changes nothing but [`Self::maps`]. Its regions have no ids.
@@ -155,12 +187,18 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.look(frame).map(|look| look.report)
+        self.check(frame)?;
+        let camera = self.cameras.get(&frame.source);
+        let mut visit = camera
+            .map(|camera| camera.visit.clone())
+            .unwrap_or_default();
+        Ok(self.look(frame, &mut visit))
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
     pub fn prior(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> PriorAt {
-        let selected = self.select(world_from_camera);
+        let mut selected = Vec::new();
+        self.select(world_from_camera, &mut selected);
         let mut prior = Prior::default();
         let views = recall_views(&self.memory, &self.settings, &selected, &Visit::default());
         self.engine
@@ -176,20 +214,20 @@ impl Pipeline {
         self.cameras.remove(source);
     }
 
-    fn look(&mut self, frame: &Frame) -> Result<Look, FrameError> {
-        let depth_m = self.checked_depth(frame)?;
-        let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
-        let observation = Observation::new(&frame.image);
+    /// Compares a checked frame with what is expected; nothing is learnt yet.
+    fn look(&mut self, frame: &Frame, visit: &mut Visit) -> Report {
+        let mut work = std::mem::take(&mut self.workspace);
+        let mut maps = std::mem::take(&mut self.maps);
+        self.engine.observe(&frame.image, &mut work.observation);
 
-        let refined = self.refine(frame, &observation, &camera.visit);
+        let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
         let world_from_camera = refined.world_from_camera;
 
-        let selected = self.select(&world_from_camera);
-        let used = self.ids(&selected);
-        camera.visit.select(&used);
+        self.select(&world_from_camera, &mut work.selected);
+        let used = self.ids(&work.selected);
+        visit.select(&used);
 
-        let mut maps = std::mem::take(&mut self.maps);
-        let views = recall_views(&self.memory, &self.settings, &selected, &camera.visit);
+        let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
         self.engine.recall(
             &views,
             &frame.intrinsics,
@@ -197,16 +235,17 @@ impl Pipeline {
             &mut maps.prior,
         );
         self.engine
-            .score(&maps.prior, &observation, &mut maps.score);
+            .score(&maps.prior, &work.observation, &mut maps.score);
         maps.intrinsics = Some(frame.intrinsics);
-        maps.evidence = BlockMap::evidence(
+        maps.evidence.find(
             &maps.score.surprise,
             frame.intrinsics.width,
             self.settings.evidence,
+            &mut work.blocks,
         );
 
         let scene = Scene {
-            depth_m: &depth_m,
+            depth_m: &work.depth_m,
             intrinsics: &frame.intrinsics,
             world_from_camera: &world_from_camera,
         };
@@ -241,16 +280,17 @@ impl Pipeline {
             pose_correction_rad: refined.correction_rad,
         };
         self.maps = maps;
-        Ok(Look {
-            world_from_camera,
-            selected,
-            depth_m,
-            camera,
-            report,
-        })
+        self.workspace = work;
+        report
     }
 
-    fn refine(&mut self, frame: &Frame, observation: &Observation, visit: &Visit) -> Refined {
+    fn refine(
+        &mut self,
+        frame: &Frame,
+        observation: &Observation,
+        visit: &Visit,
+        selected: &mut Vec<usize>,
+    ) -> Refined {
         if !self.settings.refine_pose {
             return Refined::unchanged(frame.world_from_camera);
         }
@@ -258,10 +298,10 @@ impl Pipeline {
             position_m: self.settings.pose_position_sd_m,
             rotation_rad: self.settings.pose_rotation_sd_rad,
         });
-        let mut selected = self.select(&frame.world_from_camera);
+        self.select(&frame.world_from_camera, selected);
         selected.truncate(REFINE_VIEWS);
-        let recalled = recall_views(&self.memory, &self.settings, &selected, visit);
-        let views: Vec<(&Coarse, &Pose, f32)> = recalled
+        let recalled = recall_views(&self.memory, &self.settings, selected, visit);
+        let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = recalled
             .iter()
             .map(|view| {
                 (
@@ -280,19 +320,20 @@ impl Pipeline {
         )
     }
 
-    fn select(&self, world_from_camera: &Pose) -> Vec<usize> {
+    fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {
         let poses = self
             .memory
             .viewpoints()
             .iter()
             .map(|viewpoint| &viewpoint.world_from_camera);
-        select_nearest(
+        select_into(
             poses,
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
             self.settings.view_distance_max_m,
-        )
+            selected,
+        );
     }
 
     fn ids(&self, selected: &[usize]) -> Vec<u64> {
@@ -302,8 +343,9 @@ impl Pipeline {
             .collect()
     }
 
-    /// The frame's depth with everything outside the settings' range taken as none.
-    fn checked_depth(&self, frame: &Frame) -> Result<Vec<f32>, FrameError> {
+    /// Whether a frame can be used; its depth, everything outside the settings' range taken as none, goes into the
+    /// workspace.
+    fn check(&mut self, frame: &Frame) -> Result<(), FrameError> {
         let Intrinsics { width, height, .. } = frame.intrinsics;
         if (frame.image.width, frame.image.height) != (width, height) {
             return Err(FrameError::ImageSize {
@@ -319,36 +361,38 @@ impl Pipeline {
                 expected: width * height,
             });
         }
-        let range = self.settings.depth_min_m..=self.settings.depth_max_m;
-        let mut given: Vec<f32> = frame
-            .depth_m
-            .iter()
-            .copied()
-            .filter(|z| z.is_finite() && *z > 0.0)
-            .collect();
-        let share = given.len() as f64 / frame.depth_m.len() as f64;
+        let (min_m, max_m) = (self.settings.depth_min_m, self.settings.depth_max_m);
+        let is_given = |z: f32| z.is_finite() & (z > 0.0);
+        let depth_m = &mut self.workspace.depth_m;
+        depth_m.resize(frame.depth_m.len(), 0.0);
+        let (mut given, mut valid) = (0u32, 0u32);
+        for (checked, &z) in depth_m.iter_mut().zip(&frame.depth_m) {
+            // NaN is in no range.
+            let in_range = (z >= min_m) & (z <= max_m);
+            given += u32::from(is_given(z));
+            valid += u32::from(in_range);
+            *checked = if in_range { z } else { 0.0 };
+        }
+        let share = f64::from(given) / frame.depth_m.len() as f64;
         if share < DEPTH_SHARE_MIN {
             return Err(FrameError::NoDepth {
                 valid_percent: 100.0 * share,
             });
         }
-        let valid = given.iter().filter(|z| range.contains(z)).count() as f64 / given.len() as f64;
+        let valid = f64::from(valid) / f64::from(given);
         if valid < DEPTH_IN_RANGE_MIN {
+            let given = frame.depth_m.iter().copied().filter(|&z| is_given(z));
+            let mut given: Vec<f32> = given.collect();
             let middle = given.len() / 2;
             let (_, &mut median_m, _) = given.select_nth_unstable_by(middle, f32::total_cmp);
             return Err(FrameError::DepthUnit {
                 valid_percent: 100.0 * valid,
-                min_m: *range.start(),
-                max_m: *range.end(),
+                min_m,
+                max_m,
                 median_m,
             });
         }
-        // NaN is in no range.
-        Ok(frame
-            .depth_m
-            .iter()
-            .map(|&z| if range.contains(&z) { z } else { 0.0 })
-            .collect())
+        Ok(())
     }
 }
 
@@ -358,7 +402,7 @@ fn recall_views<'a>(
     settings: &Settings,
     selected: &[usize],
     visit: &Visit,
-) -> Vec<RecallView<'a>> {
+) -> ArrayVec<RecallView<'a>, VIEWS_MAX> {
     selected
         .iter()
         .map(|&index| {

@@ -14,7 +14,7 @@ use crate::{
         viewpoint::Coarse,
     },
     stages::interpolate::project::{
-        ProjectScratch, Projector, Sample, sample_depth_m, sample_position,
+        ProjectScratch, Projector, Reach, Sample, sample_depth_m, sample_position,
     },
 };
 
@@ -108,6 +108,7 @@ struct Estimate {
 pub struct PoseRefiner {
     maps: Vec<Sample>,
     scratch: ProjectScratch,
+    reach: Reach,
     residuals: Vec<f32>,
     magnitudes: Vec<f32>,
     points: Vec<Point>,
@@ -201,12 +202,14 @@ impl PoseRefiner {
         for ((coarse, world_from_view, _), map) in
             views.iter().zip(self.maps.chunks_exact_mut(pixels.max(1)))
         {
-            Projector::new(&coarse.mesh, world_from_view, camera, world_from_camera).draw(
-                camera.width,
-                0..camera.height,
-                map,
-                &mut self.scratch,
-            );
+            Projector::new(
+                &coarse.mesh,
+                world_from_view,
+                camera,
+                world_from_camera,
+                &mut self.reach,
+            )
+            .draw(camera.width, 0..camera.height, map, &mut self.scratch);
         }
         let mut level = Level {
             width: camera.width,

@@ -6,8 +6,9 @@
 //! the robust preset). Edges may widen the prior for the score (step 4).
 
 use crate::{
+    lanes::ln,
     model::belief::{Belief, CHANNELS},
-    stages::{lanes::ln, update::UpdateRules},
+    stages::update::UpdateRules,
 };
 
 const DEGREE: usize = 12;
@@ -96,37 +97,31 @@ fn digamma(x: f64) -> f64 {
         - r * (1.0 / 12.0 - r * (1.0 / 120.0 - r * (1.0 / 252.0 - r * (1.0 / 240.0 - r / 132.0))))
 }
 
-/// Per channel the parts of the surprise that need no logarithm, and what goes under the shared ones:
-/// `(plain, beta ratio, sigma ratio)`. Beliefs are `(beta, sigma)`; `deviation` is the observation's from tau0.
+/// The parts of a channel's surprise that need no logarithm. Beliefs are `(beta, sigma)`; `deviation` is the
+/// observation's from tau0.
 #[inline(always)]
-pub fn channel_terms(
-    alpha: f32,
-    prior: (f32, f32),
-    posterior: (f32, f32),
-    deviation: f32,
-) -> (f32, f32, f32) {
+pub fn plain_terms(alpha: f32, prior: (f32, f32), posterior: (f32, f32), deviation: f32) -> f32 {
     let (beta0, sigma0) = prior;
     let (beta, sigma) = posterior;
     let precision = alpha / beta;
     // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
     let moved = sigma * deviation;
-    let plain =
-        (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5;
-    (plain, beta / beta0, sigma0 / sigma)
+    (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5
 }
 
-/// (16) to (23), nats. `ratios` are the products of the channels' ratios.
+/// (16) to (23), nats. `plain` is the channels' sum; beta and sigma, of prior and posterior, are their products: at most
+/// 65504^3.
 #[inline(always)]
 pub fn total(
     alpha0: f32,
     plain: f32,
-    beta_ratios: f32,
-    sigma_ratios: f32,
+    (beta0, sigma0): (f32, f32),
+    (beta, sigma): (f32, f32),
     gamma: &GammaTerm,
 ) -> f32 {
     let sum = plain
-        + alpha0 * ln(beta_ratios)
-        + 0.5 * ln(sigma_ratios)
+        + alpha0 * ln(beta / beta0)
+        + 0.5 * ln(sigma0 / sigma)
         + CHANNELS as f32 * gamma.at(alpha0);
     // A divergence is never negative; rounding may be.
     sum.max(0.0)
@@ -141,19 +136,26 @@ pub fn surprise(
     gamma: &GammaTerm,
 ) -> f32 {
     let mut plain = 0.0;
-    let (mut beta_ratios, mut sigma_ratios) = (1.0, 1.0);
     for (c, observed) in observed.into_iter().enumerate() {
-        let (p, b, s) = channel_terms(
+        plain += plain_terms(
             posterior.alpha,
             (prior.beta[c], prior.sigma[c]),
             (posterior.beta[c], posterior.sigma[c]),
             observed - prior.tau[c],
         );
-        plain += p;
-        beta_ratios *= b;
-        sigma_ratios *= s;
     }
-    total(prior.alpha, plain, beta_ratios, sigma_ratios, gamma)
+    let products = |belief: &Belief| {
+        let [b0, b1, b2] = belief.beta;
+        let [s0, s1, s2] = belief.sigma;
+        (b0 * b1 * b2, s0 * s1 * s2)
+    };
+    total(
+        prior.alpha,
+        plain,
+        products(prior),
+        products(posterior),
+        gamma,
+    )
 }
 
 /// From this weight on an earlier appearance takes part.

@@ -6,24 +6,25 @@ mod strips;
 
 use std::sync::{Arc, Mutex};
 
+use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
-    engine::isa::Isa,
+    isa::{Isa, for_each_isa},
     model::{
         belief::{CHANNELS, Record, ycbcr_from_rgb},
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::Viewpoint,
+        viewpoint::{Coarse, Mesh, Viewpoint},
     },
     stages::{
         exposure::exposure_gain,
         interpolate::{
-            merge::{MergeRules, MergeView},
+            merge::{MergeRules, MergeView, VIEWS_MAX},
             prior::{self, Prior},
-            project::Projector,
+            project::{Projector, Reach},
         },
         surprise::GammaTerm,
         update::UpdateRules,
@@ -56,24 +57,53 @@ pub struct Observation {
 
 impl Observation {
     pub fn new(image: &RgbImage) -> Self {
-        let pixels = image.width * image.height;
-        let mut planes: [Vec<f32>; CHANNELS] = std::array::from_fn(|_| Vec::with_capacity(pixels));
-        for rgb in image.data.chunks_exact(3) {
-            let ycbcr = ycbcr_from_rgb([f32::from(rgb[0]), f32::from(rgb[1]), f32::from(rgb[2])]);
-            for (plane, value) in planes.iter_mut().zip(ycbcr) {
-                plane.push(value);
-            }
+        let mut observation = Self::default();
+        observation.read(image, Isa::Portable);
+        observation
+    }
+
+    fn read(&mut self, image: &RgbImage, isa: Isa) {
+        (self.width, self.height) = (image.width, image.height);
+        for plane in &mut self.planes {
+            plane.resize(image.width * image.height, 0.0);
         }
-        Self {
-            width: image.width,
-            height: image.height,
-            planes,
-        }
+        let [y, cb, cr] = &mut self.planes;
+        transform_colours(isa, &image.data, y, cb, cr);
     }
 
     fn row(&self, y: usize) -> [&[f32]; CHANNELS] {
         std::array::from_fn(|channel| &self.planes[channel][y * self.width..][..self.width])
     }
+}
+
+for_each_isa! {
+    fn transform_colours(rgb: &[u8], y: &mut [f32], cb: &mut [f32], cr: &mut [f32]) = transform_kernel;
+}
+
+#[inline(always)]
+fn transform_kernel(rgb: &[u8], y: &mut [f32], cb: &mut [f32], cr: &mut [f32]) {
+    let planes = y.iter_mut().zip(cb).zip(cr);
+    for (rgb, ((y, cb), cr)) in rgb.chunks_exact(3).zip(planes) {
+        [*y, *cb, *cr] = ycbcr_from_rgb([f32::from(rgb[0]), f32::from(rgb[1]), f32::from(rgb[2])]);
+    }
+}
+
+for_each_isa! {
+    fn join(mesh: &mut Mesh, cut: f32) = join_kernel;
+}
+
+#[inline(always)]
+fn join_kernel(mesh: &mut Mesh, cut: f32) {
+    mesh.join(cut);
+}
+
+for_each_isa! {
+    fn reduce(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: f32) = reduce_kernel;
+}
+
+#[inline(always)]
+fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: f32) {
+    coarse.reduce(mesh, records, cut);
 }
 
 /// What a frame did to the prior.
@@ -95,6 +125,8 @@ pub struct CpuEngine {
     exposure_gain: bool,
     /// One a thread; never contended.
     scratch: Vec<Mutex<(StripScratch, ScoreScratch)>>,
+    /// One a view.
+    reaches: Mutex<[Reach; VIEWS_MAX]>,
 }
 
 impl CpuEngine {
@@ -122,7 +154,19 @@ impl CpuEngine {
             },
             exposure_gain: settings.exposure_gain,
             scratch,
+            reaches: Mutex::default(),
         }
+    }
+
+    /// Takes an image apart into planes; memory that is there is used again.
+    pub fn observe(&self, image: &RgbImage, observation: &mut Observation) {
+        observation.read(image, self.isa);
+    }
+
+    /// Makes what follows from a mesh's depth and its records when they are stored.
+    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: f32) {
+        join(self.isa, mesh, cut);
+        reduce(self.isa, coarse, mesh, records, cut);
     }
 
     /// Interpolates the beliefs at a pose from at most 16 views into `prior`.
@@ -133,18 +177,24 @@ impl CpuEngine {
         world_from_camera: &Pose,
         prior: &mut Prior,
     ) {
-        let projectors: Vec<Projector> = views
+        let mut reaches = self
+            .reaches
+            .lock()
+            .expect("never held by a panicked caller");
+        let projectors: ArrayVec<Projector, VIEWS_MAX> = views
             .iter()
-            .map(|view| {
+            .zip(reaches.iter_mut())
+            .map(|(view, reach)| {
                 Projector::new(
                     &view.viewpoint.mesh,
                     &view.viewpoint.world_from_camera,
                     intrinsics,
                     world_from_camera,
+                    reach,
                 )
             })
             .collect();
-        let merge_views: Vec<MergeView> = views
+        let merge_views: ArrayVec<MergeView, VIEWS_MAX> = views
             .iter()
             .map(|view| MergeView {
                 records: &view.viewpoint.records,

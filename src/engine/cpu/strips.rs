@@ -1,13 +1,17 @@
 //! The recall passes over one strip of rows: every view's mesh is drawn into a map, then the rows are merged.
 
 use crate::{
-    engine::isa::{Isa, for_each_isa},
+    isa::{Isa, for_each_isa},
     stages::interpolate::{
+        gather::Portable,
         merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
         prior::PLANES,
         project::{ProjectScratch, Projector, Sample},
     },
 };
+
+#[cfg(target_arch = "x86_64")]
+use crate::stages::interpolate::gather::Avx;
 
 for_each_isa! {
     fn draw(
@@ -26,7 +30,7 @@ for_each_isa! {
         rules: MergeRules,
         width: usize,
         row: &mut [f32],
-    ) = merge_row;
+    ) = merge_row::<Portable>, avx merge_row::<Avx>;
 }
 
 #[inline(always)]

@@ -14,7 +14,7 @@ pub use checkerboard::{CostRow, CostVolume};
 pub use messages::Belief;
 pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
 
-use crate::engine::isa::Isa;
+use crate::isa::Isa;
 use plane_sweep::{Middle, Side, Sweep};
 use rayon::prelude::*;
 
