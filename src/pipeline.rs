@@ -94,7 +94,7 @@ impl Pipeline {
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
         Self {
             engine: CpuEngine::new(&settings, pool, isa),
-            refiner: PoseRefiner::default(),
+            refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
             cameras: HashMap::new(),
             last_region_id: 0,

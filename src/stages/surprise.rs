@@ -232,37 +232,45 @@ pub fn edge_gradient_row(
     gradient: &mut [f32],
 ) {
     let width = gradient.len();
-    gradient.fill(0.0);
     let (above, here, below) = plane;
     let (seen_above, seen, seen_below) = coverage;
-    let squared = |a: f32, seen_a: f32, b: f32, seen_b: f32| {
-        let both = if seen_a > 0.0 && seen_b > 0.0 {
-            1.0
-        } else {
-            0.0
-        };
-        ((a - b) * (a - b) * both, both)
-    };
+    // Beyond the image there is nothing to compare with: any row does, with no weight.
+    let (above, has_above) = above.map_or((here, 0.0), |row| (row, 1.0));
+    let (below, has_below) = below.map_or((here, 0.0), |row| (row, 1.0));
+    let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
+    let seen_above = &seen_above.unwrap_or(seen)[..width];
+    let seen_below = &seen_below.unwrap_or(seen)[..width];
+    let seen = &seen[..width];
     for x in 0..width {
-        let (left, has_left) = if x > 0 {
-            squared(here[x], seen[x], here[x - 1], seen[x - 1])
-        } else {
-            (0.0, 0.0)
-        };
-        let (right, has_right) = if x + 1 < width {
-            squared(here[x], seen[x], here[x + 1], seen[x + 1])
-        } else {
-            (0.0, 0.0)
-        };
-        gradient[x] = (left + right) / (has_left + has_right).max(1.0);
+        let (up, has_up) = squared(here[x], seen[x], above[x], seen_above[x], has_above);
+        let (down, has_down) = squared(here[x], seen[x], below[x], seen_below[x], has_below);
+        gradient[x] = mean_of_two(up + down, has_up + has_down);
     }
-    let row = |row: Option<&[f32]>, seen_row: Option<&[f32]>, x: usize| match (row, seen_row) {
-        (Some(row), Some(seen_row)) => squared(here[x], seen[x], row[x], seen_row[x]),
-        _ => (0.0, 0.0),
+    if width < 2 {
+        return;
+    }
+    for x in 1..width - 1 {
+        let (left, has_left) = squared(here[x], seen[x], here[x - 1], seen[x - 1], 1.0);
+        let (right, has_right) = squared(here[x], seen[x], here[x + 1], seen[x + 1], 1.0);
+        gradient[x] += mean_of_two(left + right, has_left + has_right);
+    }
+    for (x, neighbour) in [(0, 1), (width - 1, width - 2)] {
+        gradient[x] += squared(here[x], seen[x], here[neighbour], seen[neighbour], 1.0).0;
+    }
+}
+
+/// Squared difference and how much it counts.
+#[inline(always)]
+fn squared(a: f32, seen_a: f32, b: f32, seen_b: f32, there: f32) -> (f32, f32) {
+    let both = if (seen_a > 0.0) & (seen_b > 0.0) {
+        there
+    } else {
+        0.0
     };
-    for (x, gradient) in gradient.iter_mut().enumerate() {
-        let (up, has_up) = row(above, seen_above, x);
-        let (down, has_down) = row(below, seen_below, x);
-        *gradient += (up + down) / (has_up + has_down).max(1.0);
-    }
+    ((a - b) * (a - b) * both, both)
+}
+
+#[inline(always)]
+fn mean_of_two(sum: f32, count: f32) -> f32 {
+    if count > 1.0 { 0.5 * sum } else { sum }
 }

@@ -7,7 +7,7 @@ mod strips;
 use std::sync::{Arc, Mutex};
 
 use arrayvec::ArrayVec;
-use rayon::ThreadPool;
+use rayon::{ThreadPool, prelude::*};
 
 use crate::{
     config::Settings,
@@ -20,7 +20,7 @@ use crate::{
         viewpoint::{Coarse, Mesh, Viewpoint},
     },
     stages::{
-        exposure::exposure_gain,
+        exposure::exposure_gain_on,
         interpolate::{
             merge::{MergeRules, MergeView, VIEWS_MAX},
             prior::{self, Prior},
@@ -34,8 +34,8 @@ use crate::{
 use score::{ScoreRules, ScoreScratch};
 use strips::StripScratch;
 
-/// Rows of a strip: its maps of seven views of 640 pixels stay within 600 KB, a core's second-level cache.
-const STRIP_ROWS: usize = 16;
+/// Rows of a strip: its maps of seven views of 640 pixels stay within 900 KB, a core's second-level cache.
+const STRIP_ROWS: usize = 24;
 
 /// A viewpoint to recall from.
 #[derive(Clone, Copy)]
@@ -206,25 +206,28 @@ impl CpuEngine {
             .collect();
         prior.resize(intrinsics.width, intrinsics.height);
         let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
-        self.pool.install(|| {
-            use rayon::prelude::*;
-            prior
-                .data
-                .par_chunks_mut(strip_values)
-                .enumerate()
-                .for_each(|(strip, rows)| {
-                    let (scratch, _) = &mut *self.thread_scratch();
-                    scratch.recall(
-                        self.isa,
-                        &projectors,
-                        &merge_views,
-                        self.merge_rules,
-                        intrinsics.width,
-                        strip * STRIP_ROWS,
-                        rows,
-                    );
-                });
-        });
+        let recall = |(strip, rows): (usize, &mut [f32])| {
+            let (scratch, _) = &mut *self.thread_scratch();
+            scratch.recall(
+                self.isa,
+                &projectors,
+                &merge_views,
+                self.merge_rules,
+                intrinsics.width,
+                strip * STRIP_ROWS,
+                rows,
+            );
+        };
+        let data = &mut prior.data;
+        if self.is_alone() {
+            data.chunks_mut(strip_values).enumerate().for_each(recall);
+        } else {
+            self.pool.install(|| {
+                data.par_chunks_mut(strip_values)
+                    .enumerate()
+                    .for_each(recall);
+            });
+        }
     }
 
     /// Updates the prior with an observation of the same size and measures the surprise.
@@ -236,14 +239,17 @@ impl CpuEngine {
             "the prior is recalled for the frame's camera"
         );
         score.gain = if self.exposure_gain {
-            exposure_gain((0..height).map(|y| {
-                let row = prior.row(y);
-                (
-                    row.plane(prior::TAU),
-                    row.plane(prior::COVERAGE),
-                    observation.row(y)[0],
-                )
-            }))
+            exposure_gain_on(
+                self.isa,
+                (0..height).map(|y| {
+                    let row = prior.row(y);
+                    (
+                        row.plane(prior::TAU),
+                        row.plane(prior::COVERAGE),
+                        observation.row(y)[0],
+                    )
+                }),
+            )
         } else {
             1.0
         };
@@ -251,38 +257,52 @@ impl CpuEngine {
         score.posterior.resize(width * height, Record::default());
         let inverse_gain = 1.0 / score.gain;
         let strip_pixels = STRIP_ROWS * width;
-        self.pool.install(|| {
-            use rayon::prelude::*;
-            score
-                .surprise
-                .par_chunks_mut(strip_pixels)
-                .zip(score.posterior.par_chunks_mut(strip_pixels))
+        let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
+            let (_, scratch) = &mut *self.thread_scratch();
+            let rows = surprise
+                .chunks_exact_mut(width)
+                .zip(posterior.chunks_exact_mut(width));
+            for (row, (surprise, posterior)) in rows.enumerate() {
+                let y = strip * STRIP_ROWS + row;
+                score::score_row(
+                    self.isa,
+                    prior,
+                    y,
+                    observation.row(y),
+                    inverse_gain,
+                    &self.score_rules,
+                    scratch,
+                    surprise,
+                    posterior,
+                );
+            }
+        };
+        let (surprise, posterior) = (&mut score.surprise, &mut score.posterior);
+        if self.is_alone() {
+            surprise
+                .chunks_mut(strip_pixels)
+                .zip(posterior.chunks_mut(strip_pixels))
                 .enumerate()
-                .for_each(|(strip, (surprise, posterior))| {
-                    let (_, scratch) = &mut *self.thread_scratch();
-                    let rows = surprise
-                        .chunks_exact_mut(width)
-                        .zip(posterior.chunks_exact_mut(width));
-                    for (row, (surprise, posterior)) in rows.enumerate() {
-                        let y = strip * STRIP_ROWS + row;
-                        score::score_row(
-                            self.isa,
-                            prior,
-                            y,
-                            observation.row(y),
-                            inverse_gain,
-                            &self.score_rules,
-                            scratch,
-                            surprise,
-                            posterior,
-                        );
-                    }
-                });
-        });
+                .for_each(update);
+        } else {
+            self.pool.install(|| {
+                surprise
+                    .par_chunks_mut(strip_pixels)
+                    .zip(posterior.par_chunks_mut(strip_pixels))
+                    .enumerate()
+                    .for_each(update);
+            });
+        }
+    }
+
+    /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
+    fn is_alone(&self) -> bool {
+        self.pool.current_num_threads() == 1
     }
 
     fn thread_scratch(&self) -> std::sync::MutexGuard<'_, (StripScratch, ScoreScratch)> {
-        let thread = rayon::current_thread_index().expect("runs inside the pool");
+        // The caller's own thread where there is only one.
+        let thread = self.pool.current_thread_index().unwrap_or(0);
         self.scratch[thread]
             .lock()
             .expect("a thread that panicked ends the process")

@@ -6,22 +6,12 @@ use crate::{
         gather::Portable,
         merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
         prior::PLANES,
-        project::{ProjectScratch, Projector, Sample},
+        project::{ProjectScratch, Projector, Sample, draw},
     },
 };
 
 #[cfg(target_arch = "x86_64")]
 use crate::stages::interpolate::gather::Avx;
-
-for_each_isa! {
-    fn draw(
-        projector: &Projector<'_>,
-        width: usize,
-        rows: std::ops::Range<usize>,
-        map: &mut [Sample],
-        scratch: &mut ProjectScratch,
-    ) = draw_kernel;
-}
 
 for_each_isa! {
     fn merge(
@@ -31,17 +21,6 @@ for_each_isa! {
         width: usize,
         row: &mut [f32],
     ) = merge_row::<Portable>, avx merge_row::<Avx>;
-}
-
-#[inline(always)]
-fn draw_kernel(
-    projector: &Projector<'_>,
-    width: usize,
-    rows: std::ops::Range<usize>,
-    map: &mut [Sample],
-    scratch: &mut ProjectScratch,
-) {
-    projector.draw(width, rows, map, scratch);
 }
 
 /// Working memory of one thread.

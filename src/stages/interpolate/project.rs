@@ -7,6 +7,7 @@ use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::isa::for_each_isa;
 use crate::lanes::{LANES, Lanes, reciprocal};
 use crate::model::{
     camera::Intrinsics,
@@ -318,6 +319,28 @@ impl<'a> Projector<'a> {
             inverse_depths[column] = inverse;
         }
     }
+}
+
+for_each_isa! {
+    /// [`Projector::draw`].
+    pub fn draw(
+        projector: &Projector<'_>,
+        width: usize,
+        rows: Range<usize>,
+        map: &mut [Sample],
+        scratch: &mut ProjectScratch,
+    ) = draw_kernel;
+}
+
+#[inline(always)]
+fn draw_kernel(
+    projector: &Projector<'_>,
+    width: usize,
+    rows: Range<usize>,
+    map: &mut [Sample],
+    scratch: &mut ProjectScratch,
+) {
+    projector.draw(width, rows, map, scratch);
 }
 
 /// Far outside any image, and small enough for [`floor`].
