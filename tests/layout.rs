@@ -77,8 +77,9 @@ fn rooms_used(text: &str) -> Vec<&'static str> {
         for head in heads {
             let head = head.trim_start();
             used.extend(ROOMS.iter().find(|room| {
-                head.strip_prefix(**room)
-                    .is_some_and(|rest| !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_'))
+                head.strip_prefix(**room).is_some_and(|rest| {
+                    !rest.starts_with(|c: char| c.is_alphanumeric() || c == '_')
+                })
             }));
         }
     }
@@ -125,7 +126,10 @@ fn imports_point_down_only() {
     for (file, text) in sources() {
         let room = file.split(['/', '.']).next().expect("a name has parts");
         let Some(own) = ROOMS.iter().position(|known| *known == room) else {
-            assert!(matches!(room, "main" | "lib"), "src/{file} is in no known room");
+            assert!(
+                matches!(room, "main" | "lib"),
+                "src/{file} is in no known room"
+            );
             continue;
         };
         for used in rooms_used(&text) {

@@ -50,6 +50,8 @@ pub struct Camera {
     calibration: Option<Lens>,
     calibration_asked: Option<Instant>,
     order: StampOrder,
+    /// Sequence of the last frame that could be read, refused or not.
+    last_received: Option<u64>,
     last_image: Option<Arc<RgbImage>>,
     snapshot: Option<Arc<Snapshot>>,
     watched_until: Option<Instant>,
@@ -111,6 +113,7 @@ impl Camera {
             calibration: None,
             calibration_asked: None,
             order: StampOrder::default(),
+            last_received: None,
             last_image: None,
             snapshot: None,
             watched_until: None,
@@ -171,6 +174,12 @@ impl Camera {
             self.status.frames_repeated += 1;
             return Ok(());
         }
+        if let Some(last) = self.last_received.replace(sequence) {
+            let gap = sequence.saturating_sub(last).saturating_sub(1);
+            if gap < SEQUENCE_GAP_MAX {
+                self.status.frames_lost += gap.saturating_sub(replaced);
+            }
+        }
         let frame = decode::frame(message).map_err(refused)?;
         if let Order::GoesBack { last_ns } = self.order.judge(stamp_ns) {
             return Err(refused(goes_back("frame", stamp_ns, last_ns)));
@@ -178,12 +187,6 @@ impl Camera {
         if let Some(calibration) = &frame.calibration {
             self.set_calibration(calibration.clone(), limits)
                 .map_err(refused)?;
-        }
-        if let Some(last) = self.status.last_sequence {
-            let gap = sequence.saturating_sub(last).saturating_sub(1);
-            if gap < SEQUENCE_GAP_MAX {
-                self.status.frames_lost += gap.saturating_sub(replaced);
-            }
         }
         self.waiting = Some(Waiting {
             frame,

@@ -79,6 +79,8 @@ struct State {
     cameras: BTreeMap<Source, Slot>,
     asks: VecDeque<Ask>,
     asks_busy: u64,
+    /// A camera came or went.
+    live_changed: bool,
     closed: bool,
 }
 
@@ -95,6 +97,8 @@ pub struct Delivery {
     pub asks: Vec<Ask>,
     /// Cameras whose frame can be taken.
     pub frames: Vec<Source>,
+    /// A camera came or went.
+    pub live_changed: bool,
     pub closed: bool,
 }
 
@@ -163,7 +167,10 @@ impl Inbox {
     /// # Errors
     /// `too_many_cameras`.
     pub fn set_live(&self, source: &Source, live: bool) -> Result<(), Refusal> {
-        self.with_slot(source, |slot| slot.live = live)
+        self.with_slot(source, |slot| slot.live = live)?;
+        self.lock().live_changed = true;
+        self.wake.notify_one();
+        Ok(())
     }
 
     /// # Errors
@@ -282,6 +289,7 @@ impl State {
     fn deliver(&mut self, held: &impl Fn(&Source) -> bool) -> Delivery {
         let mut delivery = Delivery {
             asks: self.asks.drain(..).collect(),
+            live_changed: std::mem::take(&mut self.live_changed),
             closed: self.closed,
             ..Delivery::default()
         };
@@ -305,7 +313,11 @@ impl State {
 
 impl Delivery {
     fn is_empty(&self) -> bool {
-        self.asides.is_empty() && self.asks.is_empty() && self.frames.is_empty() && !self.closed
+        self.asides.is_empty()
+            && self.asks.is_empty()
+            && self.frames.is_empty()
+            && !self.live_changed
+            && !self.closed
     }
 }
 
@@ -368,6 +380,14 @@ mod tests {
             .put_frame(&source(CAMERAS_MAX), arrival(0))
             .expect_err("no camera has been silent for a minute");
         assert_eq!(refusal.code, "too_many_cameras");
+    }
+
+    #[test]
+    fn a_camera_that_comes_or_goes_wakes_once() {
+        let inbox = Inbox::default();
+        inbox.set_live(&source(0), true).expect("room");
+        assert!(inbox.wait(None, |_| false).live_changed);
+        assert!(inbox.wait(Some(Instant::now()), |_| false).is_empty());
     }
 
     #[test]

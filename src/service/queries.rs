@@ -22,7 +22,7 @@ use super::{
     places::{Place, Places},
 };
 use crate::{
-    model::{frame::Source, refusal::Refusal},
+    model::{camera::Intrinsics, frame::Source, pose::Pose, refusal::Refusal},
     wire::{
         decode::{self, Limits},
         encode::{self, PriorPlane},
@@ -275,10 +275,7 @@ fn prior_request(query: &Query) -> Result<proto::PriorRequest, Refusal> {
     Ok(request)
 }
 
-fn camera_of(
-    request: &proto::PriorRequest,
-    limits: Limits,
-) -> Result<(crate::model::pose::Pose, crate::model::camera::Intrinsics), Refusal> {
+fn camera_of(request: &proto::PriorRequest, limits: Limits) -> Result<(Pose, Intrinsics), Refusal> {
     let (Some(pose), Some(intrinsics)) = (&request.world_from_camera, &request.intrinsics) else {
         return Err(Refusal::new(
             "bad_request",

@@ -19,7 +19,7 @@ use super::{
 use crate::{
     model::{
         frame::{Frame, RgbImage, Source},
-        pose::PoseNoise,
+        pose::{Pose, PoseNoise},
         refusal::Refusal,
     },
     pipeline::Pipeline,
@@ -235,12 +235,7 @@ impl Desk {
         }
     }
 
-    fn serve(
-        &mut self,
-        source: &Source,
-        pose: crate::model::pose::Pose,
-        packed: &PackedFrame,
-    ) -> Result<(), Refusal> {
+    fn serve(&mut self, source: &Source, pose: Pose, packed: &PackedFrame) -> Result<(), Refusal> {
         let started = Instant::now();
         let (limits, noise) = (self.limits, self.noise_default);
         let Some(camera) = self.cameras.get_mut(source) else {

@@ -37,7 +37,10 @@ async fn a_wild_stamp_and_a_reset_clock_lock_nobody_out() {
             assert_eq!(next_report(&reports).await.sequence, sequence);
         } else {
             let rejection = next_rejection(&rejections).await;
-            assert_eq!((rejection.sequence, rejection.code.as_str()), (sequence, "stamp_order"));
+            assert_eq!(
+                (rejection.sequence, rejection.code.as_str()),
+                (sequence, "stamp_order")
+            );
         }
     }
     rig.stop().await.expect("a clean stop");

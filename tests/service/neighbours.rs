@@ -15,7 +15,11 @@ async fn walk(rig: &Rig, mut beside: impl AsyncFnMut(u64)) -> Vec<SurpriseReport
     for sequence in 1..=FRAMES {
         beside(sequence).await;
         let frame = wall(&head, sequence, 0.01 * sequence as f64);
-        let frame = if sequence > FRAMES - 3 { changed(frame) } else { frame };
+        let frame = if sequence > FRAMES - 3 {
+            changed(frame)
+        } else {
+            frame
+        };
         rig.put(&head, keys::FRAME, &encode::frame(&frame)).await;
         let report = next_report(&reports).await;
         assert_eq!(report.sequence, sequence);
@@ -84,6 +88,9 @@ async fn a_robot_that_joins_and_leaves_the_place_costs_no_frame_and_no_id() {
         .flat_map(|report| report.regions.iter().map(|region| region.id))
         .collect();
     assert!(seen.len() >= 2, "the change is there in the last frames");
-    assert!(seen.iter().all(|id| *id == seen[0]), "it keeps its id: {seen:?}");
+    assert!(
+        seen.iter().all(|id| *id == seen[0]),
+        "it keeps its id: {seen:?}"
+    );
     rig.stop().await.expect("a clean stop");
 }

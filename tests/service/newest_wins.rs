@@ -2,7 +2,7 @@
 
 use surprised::wire::{encode, keys};
 
-use crate::rig::{Rig, camera, next_report, poseless, posed, wall};
+use crate::rig::{Rig, camera, next_report, posed, poseless, wall};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn the_newest_frame_wins_and_gaps_are_counted() {
@@ -12,7 +12,8 @@ async fn the_newest_frame_wins_and_gaps_are_counted() {
     rig.put_calibration(&head).await;
     // The first keeps the worker's hand on this camera until its pose comes.
     rig.put(&head, keys::FRAME, &poseless(&head, 1)).await;
-    rig.status_when("lab", |status| status["asks_busy"] == 0).await;
+    rig.status_when("lab", |status| status["asks_busy"] == 0)
+        .await;
     tokio::time::timeout(std::time::Duration::from_millis(200), reports.recv_async())
         .await
         .expect_err("no report before the pose");

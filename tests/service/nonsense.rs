@@ -44,7 +44,11 @@ impl Noise {
             _ => {
                 // Mostly in the head, where the fields are.
                 for _ in 0..=self.below(4) {
-                    let end = if self.below(2) == 0 { bytes.len() } else { bytes.len().min(120) };
+                    let end = if self.below(2) == 0 {
+                        bytes.len()
+                    } else {
+                        bytes.len().min(120)
+                    };
                     let at = self.below(end);
                     bytes[at] = self.next() as u8;
                 }
@@ -69,7 +73,8 @@ fn seeds() -> Vec<Vec<u8>> {
     let mut seeds = vec![encode::bytes(&good)];
     for (encoding, format) in encodings {
         let rgb = good.image.clone().expect("an image");
-        let picture = image::RgbImage::from_raw(rgb.width, rgb.height, rgb.data).expect("sizes agree");
+        let picture =
+            image::RgbImage::from_raw(rgb.width, rgb.height, rgb.data).expect("sizes agree");
         let mut data = std::io::Cursor::new(Vec::new());
         picture.write_to(&mut data, format).expect("in memory");
         let mut frame = good.clone();
@@ -127,9 +132,15 @@ fn decoding_nonsense_gives_a_refusal_or_a_sane_frame() {
         }
         // The other messages share most of the checks.
         drop(decode::pose_sample(&bytes));
-        drop(decode::message(&bytes).and_then(|message: proto::Calibration| decode::calibration(&message)));
+        drop(
+            decode::message(&bytes)
+                .and_then(|message: proto::Calibration| decode::calibration(&message)),
+        );
     }
-    assert!(frames > 100 && refused > 100, "{frames} frames, {refused} refused");
+    assert!(
+        frames > 100 && refused > 100,
+        "{frames} frames, {refused} refused"
+    );
 }
 
 fn resident_bytes() -> usize {
@@ -165,8 +176,9 @@ async fn ten_thousand_messages_of_nonsense_harm_nobody() {
             (_, keys::CALIBRATION) => keys::encoding::<proto::Calibration>(),
             _ => keys::encoding::<proto::Frame>(),
         };
+        let seed = seeds[noise.below(seeds.len())].clone();
         rig.session
-            .put(key, noise.mutated(seeds[noise.below(seeds.len())].clone()))
+            .put(key, noise.mutated(seed))
             .encoding(encoding)
             .congestion_control(zenoh::qos::CongestionControl::Block)
             .await
@@ -177,13 +189,17 @@ async fn ten_thousand_messages_of_nonsense_harm_nobody() {
         }
         if index % 1000 == 999 {
             let sequence = 2 + index as u64 / 1000;
-            rig.put(&honest, keys::FRAME, &posed(&honest, sequence)).await;
+            rig.put(&honest, keys::FRAME, &posed(&honest, sequence))
+                .await;
             assert_eq!(next_report(&reports).await.sequence, sequence);
         }
     }
     let status = rig.status("lab").await;
     assert!(status["cameras"].as_array().expect("a list").len() <= 64);
-    assert!(status["memory_bytes"].as_u64() <= Some(2_000_000), "{status}");
+    assert!(
+        status["memory_bytes"].as_u64() <= Some(2_000_000),
+        "{status}"
+    );
     let honest = status["cameras"]
         .as_array()
         .expect("a list")
@@ -192,6 +208,9 @@ async fn ten_thousand_messages_of_nonsense_harm_nobody() {
         .expect("it is known");
     assert_eq!(honest["refused"], serde_json::json!({}));
     let grown = resident_bytes().saturating_sub(settled);
-    assert!(grown < 64 << 20, "grown by {grown} bytes in the second half");
+    assert!(
+        grown < 64 << 20,
+        "grown by {grown} bytes in the second half"
+    );
     rig.stop().await.expect("no worker failed");
 }

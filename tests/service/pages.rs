@@ -44,8 +44,14 @@ async fn pages_show_what_the_service_knows() {
     assert_eq!(get(&rig, "/healthz").await.status, 200);
     assert_eq!(get(&rig, "/readyz").await.status, 200);
     let info = get(&rig, "/api/v1/info").await.json();
-    assert_eq!((&info["name"], &info["settings"]["views"]), (&"surprised".into(), &7.into()));
-    assert_eq!(get(&rig, "/api/v1/places").await.json()["places"], serde_json::json!([]));
+    assert_eq!(
+        (&info["name"], &info["settings"]["views"]),
+        (&"surprised".into(), &7.into())
+    );
+    assert_eq!(
+        get(&rig, "/api/v1/places").await.json()["places"],
+        serde_json::json!([])
+    );
 
     let head = camera("lab", "anna");
     let reports = rig.subscribe(&head, keys::REPORT).await;
@@ -56,14 +62,21 @@ async fn pages_show_what_the_service_knows() {
 
     assert_eq!(get(&rig, "/api/v1/places").await.json()["places"][0], "lab");
     let status = get(&rig, "/api/v1/places/lab").await.json();
-    assert_eq!((&status["frames"], &status["viewpoints"]), (&1.into(), &1.into()));
+    assert_eq!(
+        (&status["frames"], &status["viewpoints"]),
+        (&1.into(), &1.into())
+    );
     let views = get(&rig, "/api/v1/places/lab/views").await.json();
     assert_eq!(views["views"][0]["camera"], "head");
     let path = "/api/v1/places/lab/robots/anna/head";
     assert_eq!(get(&rig, path).await.json()["report"]["sequence"], "1");
     for picture in ["frame", "expected", "surprise", "uncertainty"] {
         let page = get(&rig, &format!("{path}/{picture}.png")).await;
-        assert!(page.head.contains("content-type: image/png"), "{}", page.head);
+        assert!(
+            page.head.contains("content-type: image/png"),
+            "{}",
+            page.head
+        );
         let picture = image::load_from_memory(&page.body).expect("a png");
         assert_eq!((picture.width(), picture.height()), (64, 48));
     }
@@ -76,7 +89,11 @@ async fn pages_show_what_the_service_knows() {
     ] {
         let page = get(&rig, missing).await;
         assert_eq!(page.status, 404, "{missing}");
-        assert!(page.head.contains("application/problem+json"), "{}", page.head);
+        assert!(
+            page.head.contains("application/problem+json"),
+            "{}",
+            page.head
+        );
         assert!(page.json()["detail"].is_string());
     }
     rig.stop().await.expect("a clean stop");

@@ -15,14 +15,20 @@ async fn a_frame_waits_for_the_pose_after_it_and_stands_between_the_two() {
     rig.put_calibration(&head).await;
     let stamp_ns = wall(&head, 1, 0.0).stamp_ns;
     let before = encode::pose_sample(stamp_ns - SECOND / 10, &Pose::translation(1.0, 0.0, 0.0));
-    let after = encode::pose_sample(stamp_ns + SECOND * 3 / 10, &Pose::translation(3.0, 0.0, 0.0));
+    let after = encode::pose_sample(
+        stamp_ns + SECOND * 3 / 10,
+        &Pose::translation(3.0, 0.0, 0.0),
+    );
     rig.put(&head, keys::POSE, &before).await;
     rig.put(&head, keys::FRAME, &poseless(&head, 1)).await;
     rig.status_when("lab", |status| status["cameras"][0]["robot"] == "anna")
         .await;
     assert!(reports.is_empty(), "the pose after the frame has not come");
     rig.put(&head, keys::POSE, &after).await;
-    let pose = next_report(&reports).await.world_from_camera.expect("a pose");
+    let pose = next_report(&reports)
+        .await
+        .world_from_camera
+        .expect("a pose");
     let position = pose.position.expect("a position");
     assert!((position.x - 1.5).abs() < 1e-9, "{position:?}");
     rig.stop().await.expect("a clean stop");

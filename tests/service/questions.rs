@@ -20,7 +20,9 @@ async fn prior_evaluate_views_and_status_are_answered() {
 
     let prior = keys::memory(ROOT, "lab", "prior");
     let by_parameters = rig
-        .ask(&format!("{prior}?{FROM_HERE};planes=expected,coverage,depth,parameters,uncertainty"))
+        .ask(&format!(
+            "{prior}?{FROM_HERE};planes=expected,coverage,depth,parameters,uncertainty"
+        ))
         .await;
     let request = proto::PriorRequest {
         world_from_camera: Some(encode::pose(&wall(&head, 1, 0.0).world_from_camera)),

@@ -18,12 +18,20 @@ const SPOILED: [(&str, Spoil); 22] = [
     ("no_image", |frame| frame.image = None),
     ("no_depth", |frame| frame.depth = None),
     ("no_pose", |frame| frame.world_from_camera = None),
-    ("bad_pose", |frame| pose(frame).position.as_mut().expect("set").x = f64::NAN),
-    ("bad_pose", |frame| pose(frame).orientation.as_mut().expect("set").w = 1.1),
+    ("bad_pose", |frame| {
+        pose(frame).position.as_mut().expect("set").x = f64::NAN
+    }),
+    ("bad_pose", |frame| {
+        pose(frame).orientation.as_mut().expect("set").w = 1.1
+    }),
     ("bad_pose", |frame| pose(frame).orientation = None),
-    ("bad_pose", |frame| pose(frame).position.as_mut().expect("set").y = 1e30),
+    ("bad_pose", |frame| {
+        pose(frame).position.as_mut().expect("set").y = 1e30
+    }),
     ("pose_noise", |frame| frame.pose_position_sd = -1.0),
-    ("image_encoding", |frame| image(frame).encoding = "yuyv".to_owned()),
+    ("image_encoding", |frame| {
+        image(frame).encoding = "yuyv".to_owned()
+    }),
     ("byte_count", |frame| image(frame).data.truncate(7)),
     ("step", |frame| image(frame).step = 3),
     ("side", |frame| image(frame).width = 3),
@@ -32,8 +40,12 @@ const SPOILED: [(&str, Spoil); 22] = [
         image(frame).width = 8000;
         image(frame).height = 8000;
     }),
-    ("image_data", |frame| image(frame).encoding = "jpeg".to_owned()),
-    ("depth_encoding", |frame| depth(frame).encoding = "rgb8".to_owned()),
+    ("image_data", |frame| {
+        image(frame).encoding = "jpeg".to_owned()
+    }),
+    ("depth_encoding", |frame| {
+        depth(frame).encoding = "rgb8".to_owned()
+    }),
     ("depth_size", |frame| {
         depth(frame).width /= 2;
         depth(frame).height /= 2;
@@ -89,7 +101,10 @@ async fn what_is_wrong_is_said_and_the_memory_stays_as_it_was() {
         assert!(rejection.detail.len() > 20);
     }
     rig.session
-        .put(head.key("test/surprised", keys::FRAME), encode::bytes(&posed(&head, 50)))
+        .put(
+            head.key("test/surprised", keys::FRAME),
+            encode::bytes(&posed(&head, 50)),
+        )
         .encoding("image/png")
         .await
         .expect("put");

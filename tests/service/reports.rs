@@ -15,7 +15,11 @@ async fn every_frame_gets_a_report_and_a_change_is_a_region() {
         let report = next_report(&reports).await;
         assert_eq!(report.sequence, sequence);
         assert_eq!(
-            (report.place.as_str(), report.robot.as_str(), report.camera.as_str()),
+            (
+                report.place.as_str(),
+                report.robot.as_str(),
+                report.camera.as_str()
+            ),
             ("lab", "anna", "head")
         );
         assert!(report.learned && report.processing_seconds > 0.0);

@@ -17,12 +17,7 @@ use surprised::{
     },
 };
 use tokio::{sync::oneshot, task::JoinHandle, time::timeout};
-use zenoh::{
-    Session,
-    handlers::FifoChannelHandler,
-    pubsub::Subscriber,
-    sample::Sample,
-};
+use zenoh::{Session, handlers::FifoChannelHandler, pubsub::Subscriber, sample::Sample};
 
 /// Of everything that is awaited: far more than it takes, so that only a lost message fails.
 pub const PATIENCE: Duration = Duration::from_secs(30);
@@ -145,7 +140,11 @@ impl Rig {
         self.try_ask(selector, None).await.expect("an answer")
     }
 
-    pub async fn try_ask(&self, selector: &str, payload: Option<Vec<u8>>) -> Result<Vec<u8>, String> {
+    pub async fn try_ask(
+        &self,
+        selector: &str,
+        payload: Option<Vec<u8>>,
+    ) -> Result<Vec<u8>, String> {
         let mut get = self.session.get(selector).timeout(PATIENCE);
         if let Some(payload) = payload {
             get = get.payload(payload);
@@ -154,9 +153,7 @@ impl Rig {
         let reply = patient(replies.recv_async()).await.expect("a reply");
         match reply.into_result() {
             Ok(sample) => Ok(sample.payload().to_bytes().into_owned()),
-            Err(error) => {
-                Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned())
-            }
+            Err(error) => Err(String::from_utf8_lossy(&error.payload().to_bytes()).into_owned()),
         }
     }
 }
@@ -200,7 +197,8 @@ pub fn wall(camera: &CameraPath, sequence: u64, x_m: f64) -> Frame {
         for u in 0..CAMERA.width {
             let point = CAMERA.unproject(u as f64, v as f64, depth_m);
             let (x, y) = (point.x + x_m, point.y);
-            let wave = |phase: f64| (128.0 + 60.0 * (9.0 * x + phase).sin() * (7.0 * y).cos()) as u8;
+            let wave =
+                |phase: f64| (128.0 + 60.0 * (9.0 * x + phase).sin() * (7.0 * y).cos()) as u8;
             data.extend([wave(0.0), wave(1.0), wave(2.0)]);
         }
     }

@@ -17,5 +17,8 @@ async fn the_last_frame_is_finished_and_reported() {
     rig.status("lab").await;
     let stopped = tokio::spawn(rig.stop());
     assert_eq!(next_report(&reports).await.sequence, 2);
-    stopped.await.expect("no panic").expect("within the deadline");
+    stopped
+        .await
+        .expect("no panic")
+        .expect("within the deadline");
 }
