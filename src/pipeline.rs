@@ -14,13 +14,14 @@ use crate::{
     memory::{Memory, visit::Visit},
     model::{
         camera::Intrinsics,
-        frame::{Frame, FrameError, Source},
+        frame::{DepthSource, Frame, FrameError, Sides, Source},
         pose::{Pose, PoseNoise},
         report::Report,
-        viewpoint::{Coarse, Mesh, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
+        depth::{InverseDepthRange, SidesDepth},
         interpolate::prior::{self, Prior},
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
         select::select_nearest,
@@ -31,6 +32,12 @@ use crate::{
 const DEPTH_SHARE_MIN: f64 = 0.01;
 /// When less of the depth than this lies in the settings' range, its unit must be wrong.
 const DEPTH_IN_RANGE_MIN: f64 = 0.1;
+
+/// Pixels times labels that depth is computed of: 250 MB of costs, and somewhat more for what is sent between pixels.
+const DEPTH_COSTS_MAX: usize = 1 << 28;
+/// Labels between neighbours that still are one surface: a slanted one moves by one at a time, and refinement below a
+/// label adds to that on both sides.
+const LABELS_JOINED: f32 = 1.5;
 
 /// Everything that was computed for the last frame, until the next.
 #[derive(Debug, Clone, Default)]
@@ -61,14 +68,25 @@ struct Camera {
 struct Look {
     world_from_camera: Pose,
     selected: Vec<usize>,
-    depth_m: Vec<f32>,
+    depth: Depth,
     camera: Camera,
     report: Report,
 }
 
+/// The surface that a frame shows.
+struct Depth {
+    /// Metres; 0 = none, or out of the settings' range.
+    depth_m: Vec<f32>,
+    cut: MeshCut,
+}
+
 pub struct Pipeline {
     settings: Settings,
+    pool: Arc<ThreadPool>,
     engine: CpuEngine,
+    sides_depth: SidesDepth,
+    /// What is expected where depth is computed; kept for its allocation.
+    expected: Prior,
     refiner: PoseRefiner,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
@@ -85,7 +103,10 @@ impl Pipeline {
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
         Self {
-            engine: CpuEngine::new(&settings, pool, isa),
+            sides_depth: SidesDepth::new(depth_range(&settings)),
+            engine: CpuEngine::new(&settings, pool.clone(), isa),
+            pool,
+            expected: Prior::default(),
             refiner: PoseRefiner::default(),
             memory: Memory::default(),
             cameras: HashMap::new(),
@@ -116,14 +137,14 @@ impl Pipeline {
         let Look {
             world_from_camera,
             selected,
-            depth_m,
+            depth: Depth { depth_m, cut },
             mut camera,
             mut report,
         } = self.look(frame)?;
         let records = self.maps.score.posterior.clone();
-        let mesh = Mesh::new(frame.intrinsics, depth_m, self.settings.mesh_cut);
+        let mesh = Mesh::new(frame.intrinsics, depth_m, cut);
         let viewpoint = Viewpoint {
-            coarse: Coarse::new(&mesh, &records, self.settings.mesh_cut),
+            coarse: Coarse::new(&mesh, &records, cut),
             id: 0,
             world_from_camera,
             world_from_home: world_from_camera,
@@ -177,8 +198,8 @@ impl Pipeline {
     }
 
     fn look(&mut self, frame: &Frame) -> Result<Look, FrameError> {
-        let depth_m = self.checked_depth(frame)?;
         let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
+        let depth = self.depth(frame, &camera.visit)?;
         let observation = Observation::new(&frame.image);
 
         let refined = self.refine(frame, &observation, &camera.visit);
@@ -206,7 +227,7 @@ impl Pipeline {
         );
 
         let scene = Scene {
-            depth_m: &depth_m,
+            depth_m: &depth.depth_m,
             intrinsics: &frame.intrinsics,
             world_from_camera: &world_from_camera,
         };
@@ -244,7 +265,7 @@ impl Pipeline {
         Ok(Look {
             world_from_camera,
             selected,
-            depth_m,
+            depth,
             camera,
             report,
         })
@@ -302,8 +323,8 @@ impl Pipeline {
             .collect()
     }
 
-    /// The frame's depth with everything outside the settings' range taken as none.
-    fn checked_depth(&self, frame: &Frame) -> Result<Vec<f32>, FrameError> {
+    /// The frame's depth, given or computed, with everything outside the settings' range taken as none.
+    fn depth(&mut self, frame: &Frame, visit: &Visit) -> Result<Depth, FrameError> {
         let Intrinsics { width, height, .. } = frame.intrinsics;
         if (frame.image.width, frame.image.height) != (width, height) {
             return Err(FrameError::ImageSize {
@@ -313,25 +334,29 @@ impl Pipeline {
                 height,
             });
         }
-        if frame.depth_m.len() != width * height {
+        match &frame.depth {
+            DepthSource::Given(depth_m) => Ok(Depth {
+                depth_m: self.checked_depth(depth_m, width * height)?,
+                cut: self.settings.mesh_cut.into(),
+            }),
+            DepthSource::Sides(sides) => self.depth_from_sides(frame, sides, visit),
+        }
+    }
+
+    fn checked_depth(&self, depth_m: &[f32], pixels: usize) -> Result<Vec<f32>, FrameError> {
+        if depth_m.len() != pixels {
             return Err(FrameError::DepthSize {
-                got: frame.depth_m.len(),
-                expected: width * height,
+                got: depth_m.len(),
+                expected: pixels,
             });
         }
         let range = self.settings.depth_min_m..=self.settings.depth_max_m;
-        let mut given: Vec<f32> = frame
-            .depth_m
+        let mut given: Vec<f32> = depth_m
             .iter()
             .copied()
             .filter(|z| z.is_finite() && *z > 0.0)
             .collect();
-        let share = given.len() as f64 / frame.depth_m.len() as f64;
-        if share < DEPTH_SHARE_MIN {
-            return Err(FrameError::NoDepth {
-                valid_percent: 100.0 * share,
-            });
-        }
+        enough(given.len(), pixels)?;
         let valid = given.iter().filter(|z| range.contains(z)).count() as f64 / given.len() as f64;
         if valid < DEPTH_IN_RANGE_MIN {
             let middle = given.len() / 2;
@@ -343,13 +368,95 @@ impl Pipeline {
                 median_m,
             });
         }
-        // NaN is in no range.
-        Ok(frame
-            .depth_m
-            .iter()
-            .map(|&z| if range.contains(&z) { z } else { 0.0 })
-            .collect())
+        Ok(in_range(&self.settings, depth_m))
     }
+
+    fn depth_from_sides(
+        &mut self,
+        frame: &Frame,
+        sides: &Sides,
+        visit: &Visit,
+    ) -> Result<Depth, FrameError> {
+        for (side, view) in [("left", &sides.left), ("right", &sides.right)] {
+            let (got, camera) = (&view.image, &view.intrinsics);
+            if (got.width, got.height) != (camera.width, camera.height) {
+                return Err(FrameError::SideSize {
+                    side,
+                    got_width: got.width,
+                    got_height: got.height,
+                    width: camera.width,
+                    height: camera.height,
+                });
+            }
+        }
+        let pixels = frame.intrinsics.pixels();
+        let labels = self.settings.depth_labels;
+        if pixels.saturating_mul(labels) > DEPTH_COSTS_MAX {
+            return Err(FrameError::DepthTooLarge {
+                pixels,
+                labels,
+                most: DEPTH_COSTS_MAX,
+            });
+        }
+        let expected_m = self.expected_depth(frame, visit);
+        let image = frame.image.grey();
+        let computed = self.pool.install(|| {
+            self.sides_depth
+                .compute(&frame.intrinsics, &image, sides, expected_m.as_deref())
+        });
+        let (inverse_depth, computed_m) = (computed.label_step * LABELS_JOINED, &computed.depth_m);
+        enough(computed_m.iter().filter(|z| **z > 0.0).count(), pixels)?;
+        Ok(Depth {
+            depth_m: in_range(&self.settings, computed_m),
+            cut: MeshCut {
+                share: self.settings.mesh_cut,
+                inverse_depth,
+            },
+        })
+    }
+
+    /// What the memory expects from the frame's pose as it was given: good enough where the images say nothing.
+    fn expected_depth(&mut self, frame: &Frame, visit: &Visit) -> Option<Vec<f32>> {
+        let selected = self.select(&frame.world_from_camera);
+        if selected.is_empty() {
+            return None;
+        }
+        let views = recall_views(&self.memory, &self.settings, &selected, visit);
+        self.engine.recall(
+            &views,
+            &frame.intrinsics,
+            &frame.world_from_camera,
+            &mut self.expected,
+        );
+        Some(self.expected.plane(prior::DEPTH).collect())
+    }
+}
+
+fn in_range(settings: &Settings, depth_m: &[f32]) -> Vec<f32> {
+    let range = settings.depth_min_m..=settings.depth_max_m;
+    // NaN is in no range.
+    let kept = |&z: &f32| if range.contains(&z) { z } else { 0.0 };
+    depth_m.iter().map(kept).collect()
+}
+
+fn enough(valid: usize, pixels: usize) -> Result<(), FrameError> {
+    let share = valid as f64 / pixels as f64;
+    if share < DEPTH_SHARE_MIN {
+        return Err(FrameError::NoDepth {
+            valid_percent: 100.0 * share,
+        });
+    }
+    Ok(())
+}
+
+/// The hypotheses where depth is computed.
+pub fn depth_range(settings: &Settings) -> InverseDepthRange {
+    InverseDepthRange::new(
+        1.0 / settings.depth_far_m,
+        1.0 / settings.depth_near_m,
+        settings.depth_labels,
+    )
+    .expect("settings were validated")
 }
 
 /// The selected viewpoints with the weights that this visit gives them.

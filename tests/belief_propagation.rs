@@ -67,7 +67,10 @@ impl Grid {
         }
     }
 
-    #[allow(clippy::needless_range_loop, reason = "a direction indexes three tables")]
+    #[allow(
+        clippy::needless_range_loop,
+        reason = "a direction indexes three tables"
+    )]
     fn iterate(
         &mut self,
         iteration: usize,

@@ -6,6 +6,33 @@ use super::{belief::Record, camera::Intrinsics, frame::Source, pose::Pose};
 pub const UPPER_LEFT: u8 = 1;
 pub const LOWER_RIGHT: u8 = 2;
 
+/// Where a mesh is cut: between neighbours whose depths differ by more than both say.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeshCut {
+    /// Of the nearer depth.
+    pub share: f32,
+    /// Of inverse depth, 1/m: how far two points of one surface may lie apart where depth is only known in steps of it.
+    pub inverse_depth: f32,
+}
+
+impl From<f32> for MeshCut {
+    /// For depth that is measured: the share alone.
+    fn from(share: f32) -> Self {
+        Self {
+            share,
+            inverse_depth: 0.0,
+        }
+    }
+}
+
+impl MeshCut {
+    #[inline]
+    fn joins(self, z_min: f32, z_max: f32) -> bool {
+        let allowed = self.share.max(self.inverse_depth * z_max);
+        z_max - z_min <= allowed * z_min
+    }
+}
+
 /// The surface seen from a viewpoint: vertices at pixel centres, two triangles a quad, split from its upper right to
 /// its lower left corner.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,14 +47,16 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`.
-    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: f32) -> Self {
+    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`, or their inverse depths
+    /// are as close as `cut` says.
+    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: impl Into<MeshCut>) -> Self {
+        let cut = cut.into();
         let Intrinsics { width, height, .. } = intrinsics;
         assert_eq!(depth_m.len(), width * height, "one depth a pixel");
         let joined = |a: f32, b: f32, c: f32| {
             let z_min = a.min(b).min(c);
             let z_max = a.max(b).max(c);
-            z_min > 0.0 && z_max - z_min <= cut * z_min
+            z_min > 0.0 && cut.joins(z_min, z_max)
         };
         let mut mask = Vec::with_capacity(width.saturating_sub(1) * height.saturating_sub(1));
         // Half of a camera one pixel wide has no column, and no row then.
@@ -78,7 +107,8 @@ const COARSE_DEPTHS_MIN: usize = 3;
 
 impl Coarse {
     /// Means over 2x2 pixels; `cut` as for [`Mesh::new`].
-    pub fn new(mesh: &Mesh, records: &[Record], cut: f32) -> Self {
+    pub fn new(mesh: &Mesh, records: &[Record], cut: impl Into<MeshCut>) -> Self {
+        let cut = cut.into();
         let fine = mesh.intrinsics;
         let coarse = fine.half();
         let mut depth_m = Vec::with_capacity(coarse.pixels());
@@ -108,14 +138,14 @@ impl Coarse {
 }
 
 /// Mean of the depths that are there; 0 where they are too few or not on one surface.
-fn coarse_depth_m(four: [f32; 4], cut: f32) -> f32 {
+fn coarse_depth_m(four: [f32; 4], cut: MeshCut) -> f32 {
     let (mut count, mut sum, mut low, mut high) = (0, 0.0, f32::INFINITY, 0.0f32);
     for z in four.into_iter().filter(|z| *z > 0.0) {
         count += 1;
         sum += z;
         (low, high) = (low.min(z), high.max(z));
     }
-    if count >= COARSE_DEPTHS_MIN && high - low <= cut * low {
+    if count >= COARSE_DEPTHS_MIN && cut.joins(low, high) {
         sum / count as f32
     } else {
         0.0

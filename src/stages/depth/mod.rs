@@ -8,11 +8,13 @@ mod lanes;
 mod messages;
 mod plane_sweep;
 mod refine;
+mod sides;
 
 pub use belief_propagation::{BeliefPropagation, Contrast, PropagationSettings, Smoothness};
 pub use checkerboard::{CostRow, CostVolume};
 pub use messages::Belief;
 pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
+pub use sides::SidesDepth;
 
 use crate::engine::isa::Isa;
 use plane_sweep::{Middle, Side, Sweep};
