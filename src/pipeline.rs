@@ -14,13 +14,14 @@ use crate::{
     model::{
         belief::Record,
         camera::Intrinsics,
-        frame::{Frame, FrameError, Source},
+        frame::{DepthSource, Frame, FrameError, Sides, Source},
         pose::{Pose, PoseNoise},
         report::Report,
-        viewpoint::{Coarse, Mesh, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
+        depth::{InverseDepthRange, SidesDepth, given},
         interpolate::{
             merge::VIEWS_MAX,
             prior::{self, Prior},
@@ -30,10 +31,11 @@ use crate::{
     },
 };
 
-/// Less depth than this share of the image is none: such a viewpoint could never be recalled.
-const DEPTH_SHARE_MIN: f64 = 0.01;
-/// When less of the depth than this lies in the settings' range, its unit must be wrong.
-const DEPTH_IN_RANGE_MIN: f64 = 0.1;
+/// Pixels times labels that depth is computed of: 250 MB of costs, and somewhat more for what is sent between pixels.
+const DEPTH_COSTS_MAX: usize = 1 << 28;
+/// Labels between neighbours that still are one surface: a slanted one moves by one at a time, and refinement below a
+/// label adds to that on both sides.
+const LABELS_JOINED: f32 = 1.5;
 
 /// Everything that was computed for the last frame, until the next.
 #[derive(Debug, Clone, Default)]
@@ -63,8 +65,11 @@ struct Camera {
 /// Working memory between frames: what was overwritten is filled again.
 #[derive(Default)]
 struct Workspace {
-    /// Checked, metres.
+    /// Metres; 0 = none, or out of the settings' range.
     depth_m: Vec<f32>,
+    cut: MeshCut,
+    /// What is expected where depth is computed.
+    expected: Prior,
     observation: Observation,
     selected: Vec<usize>,
     blocks: BlockMap,
@@ -75,6 +80,8 @@ struct Workspace {
 
 pub struct Pipeline {
     settings: Settings,
+    pool: Arc<ThreadPool>,
+    sides_depth: SidesDepth,
     engine: CpuEngine,
     refiner: PoseRefiner,
     memory: Memory,
@@ -93,7 +100,9 @@ impl Pipeline {
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
         Self {
-            engine: CpuEngine::new(&settings, pool, isa),
+            sides_depth: SidesDepth::new(depth_range(&settings)),
+            engine: CpuEngine::new(&settings, pool.clone(), isa),
+            pool,
             refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
             cameras: HashMap::new(),
@@ -122,7 +131,7 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.check(frame)?;
+        self.depth(frame)?;
         let mut camera = match self.cameras.get_mut(&frame.source) {
             Some(camera) => std::mem::take(camera),
             None => Camera::default(),
@@ -155,7 +164,7 @@ impl Pipeline {
         records.clear();
         records.extend_from_slice(&self.maps.score.posterior);
         self.engine
-            .prepare(&mut mesh, &records, &mut coarse, self.settings.mesh_cut);
+            .prepare(&mut mesh, &records, &mut coarse, work.cut);
         let viewpoint = Viewpoint {
             coarse,
             id: 0,
@@ -187,7 +196,7 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.check(frame)?;
+        self.depth(frame)?;
         let camera = self.cameras.get(&frame.source);
         let mut visit = camera
             .map(|camera| camera.visit.clone())
@@ -343,9 +352,8 @@ impl Pipeline {
             .collect()
     }
 
-    /// Whether a frame can be used; its depth, everything outside the settings' range taken as none, goes into the
-    /// workspace.
-    fn check(&mut self, frame: &Frame) -> Result<(), FrameError> {
+    /// The frame's depth, given or computed, goes into the workspace.
+    fn depth(&mut self, frame: &Frame) -> Result<(), FrameError> {
         let Intrinsics { width, height, .. } = frame.intrinsics;
         if (frame.image.width, frame.image.height) != (width, height) {
             return Err(FrameError::ImageSize {
@@ -355,45 +363,96 @@ impl Pipeline {
                 height,
             });
         }
-        if frame.depth_m.len() != width * height {
-            return Err(FrameError::DepthSize {
-                got: frame.depth_m.len(),
-                expected: width * height,
-            });
+        match &frame.depth {
+            DepthSource::Given(depth_m) => {
+                self.workspace.cut = self.settings.mesh_cut.into();
+                given::check(
+                    depth_m,
+                    width * height,
+                    &self.settings,
+                    &mut self.workspace.depth_m,
+                )
+            }
+            DepthSource::Sides(sides) => self.depth_from_sides(frame, sides),
         }
-        let (min_m, max_m) = (self.settings.depth_min_m, self.settings.depth_max_m);
-        let is_given = |z: f32| z.is_finite() & (z > 0.0);
-        let depth_m = &mut self.workspace.depth_m;
-        depth_m.resize(frame.depth_m.len(), 0.0);
-        let (mut given, mut valid) = (0u32, 0u32);
-        for (checked, &z) in depth_m.iter_mut().zip(&frame.depth_m) {
-            // NaN is in no range.
-            let in_range = (z >= min_m) & (z <= max_m);
-            given += u32::from(is_given(z));
-            valid += u32::from(in_range);
-            *checked = if in_range { z } else { 0.0 };
-        }
-        let share = f64::from(given) / frame.depth_m.len() as f64;
-        if share < DEPTH_SHARE_MIN {
-            return Err(FrameError::NoDepth {
-                valid_percent: 100.0 * share,
-            });
-        }
-        let valid = f64::from(valid) / f64::from(given);
-        if valid < DEPTH_IN_RANGE_MIN {
-            let given = frame.depth_m.iter().copied().filter(|&z| is_given(z));
-            let mut given: Vec<f32> = given.collect();
-            let middle = given.len() / 2;
-            let (_, &mut median_m, _) = given.select_nth_unstable_by(middle, f32::total_cmp);
-            return Err(FrameError::DepthUnit {
-                valid_percent: 100.0 * valid,
-                min_m,
-                max_m,
-                median_m,
-            });
-        }
-        Ok(())
     }
+
+    fn depth_from_sides(&mut self, frame: &Frame, sides: &Sides) -> Result<(), FrameError> {
+        for (side, view) in [("left", &sides.left), ("right", &sides.right)] {
+            let (got, camera) = (&view.image, &view.intrinsics);
+            if (got.width, got.height) != (camera.width, camera.height) {
+                return Err(FrameError::SideSize {
+                    side,
+                    got_width: got.width,
+                    got_height: got.height,
+                    width: camera.width,
+                    height: camera.height,
+                });
+            }
+        }
+        let pixels = frame.intrinsics.pixels();
+        let labels = self.settings.depth_labels;
+        if pixels.saturating_mul(labels) > DEPTH_COSTS_MAX {
+            return Err(FrameError::DepthTooLarge {
+                pixels,
+                labels,
+                most: DEPTH_COSTS_MAX,
+            });
+        }
+        let expected_m = self.expected_depth(frame);
+        let image = frame.image.grey();
+        let computed = self.pool.install(|| {
+            self.sides_depth
+                .compute(&frame.intrinsics, &image, sides, expected_m.as_deref())
+        });
+        let (inverse_depth, computed_m) = (computed.label_step * LABELS_JOINED, &computed.depth_m);
+        self.workspace.cut = MeshCut {
+            share: self.settings.mesh_cut,
+            inverse_depth,
+        };
+        given::check(
+            computed_m,
+            pixels,
+            &self.settings,
+            &mut self.workspace.depth_m,
+        )
+    }
+
+    /// What the memory expects from the frame's pose as it was given: good enough where the images say nothing.
+    fn expected_depth(&mut self, frame: &Frame) -> Option<Vec<f32>> {
+        let work = &mut self.workspace;
+        let mut selected = std::mem::take(&mut work.selected);
+        let mut expected = std::mem::take(&mut work.expected);
+        self.select(&frame.world_from_camera, &mut selected);
+        let depth_m = (!selected.is_empty()).then(|| {
+            let visit = Visit::default();
+            let visit = self
+                .cameras
+                .get(&frame.source)
+                .map_or(&visit, |camera| &camera.visit);
+            let views = recall_views(&self.memory, &self.settings, &selected, visit);
+            self.engine.recall(
+                &views,
+                &frame.intrinsics,
+                &frame.world_from_camera,
+                &mut expected,
+            );
+            expected.plane(prior::DEPTH).collect()
+        });
+        self.workspace.selected = selected;
+        self.workspace.expected = expected;
+        depth_m
+    }
+}
+
+/// The hypotheses where depth is computed.
+pub fn depth_range(settings: &Settings) -> InverseDepthRange {
+    InverseDepthRange::new(
+        1.0 / settings.depth_far_m,
+        1.0 / settings.depth_near_m,
+        settings.depth_labels,
+    )
+    .expect("settings were validated")
 }
 
 /// The selected viewpoints with the weights that this visit gives them.

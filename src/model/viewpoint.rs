@@ -13,6 +13,33 @@ use super::{
 pub const UPPER_LEFT: u8 = 1;
 pub const LOWER_RIGHT: u8 = 2;
 
+/// Where a mesh is cut: between neighbours whose depths differ by more than both say.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct MeshCut {
+    /// Of the nearer depth.
+    pub share: f32,
+    /// Of inverse depth, 1/m: how far two points of one surface may lie apart where depth is only known in steps of it.
+    pub inverse_depth: f32,
+}
+
+impl From<f32> for MeshCut {
+    /// For depth that is measured: the share alone.
+    fn from(share: f32) -> Self {
+        Self {
+            share,
+            inverse_depth: 0.0,
+        }
+    }
+}
+
+impl MeshCut {
+    #[inline(always)]
+    fn joins(self, z_min: f32, z_max: f32) -> bool {
+        let allowed = self.share.max(self.inverse_depth * z_max);
+        z_max - z_min <= allowed * z_min
+    }
+}
+
 /// The surface seen from a viewpoint: vertices at pixel centres, two triangles a quad, split from its upper right to
 /// its lower left corner.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -29,20 +56,21 @@ pub struct Mesh {
 }
 
 impl Mesh {
-    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`.
-    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: f32) -> Self {
+    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`, or their inverse depths
+    /// are as close as `cut` says.
+    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: impl Into<MeshCut>) -> Self {
         let mut mesh = Self {
             intrinsics,
             depth_m,
             ..Self::default()
         };
-        mesh.join(cut);
+        mesh.join(cut.into());
         mesh
     }
 
     /// Makes everything that follows from intrinsics and depth; memory that is there is used again.
     #[inline(always)]
-    pub fn join(&mut self, cut: f32) {
+    pub fn join(&mut self, cut: MeshCut) {
         let Intrinsics { width, height, .. } = self.intrinsics;
         assert_eq!(self.depth_m.len(), width * height, "one depth a pixel");
         let blocks = self.blocks();
@@ -65,7 +93,7 @@ impl Mesh {
                 let (c, d) = (lower[column], lower[column + 1]);
                 // What both triangles share.
                 let (near, far) = (b.min(c), b.max(c));
-                let joined = |near: f32, far: f32| (near > 0.0) & (far - near <= cut * near);
+                let joined = |near: f32, far: f32| (near > 0.0) & cut.joins(near, far);
                 let upper_left = joined(near.min(a), far.max(a));
                 let lower_right = joined(near.min(d), far.max(d));
                 mask[column] =
@@ -119,15 +147,15 @@ const COARSE_DEPTHS_MIN: f32 = 3.0;
 
 impl Coarse {
     /// Means over 2x2 pixels; `cut` as for [`Mesh::new`].
-    pub fn new(mesh: &Mesh, records: &[Record], cut: f32) -> Self {
+    pub fn new(mesh: &Mesh, records: &[Record], cut: impl Into<MeshCut>) -> Self {
         let mut coarse = Self::default();
-        coarse.reduce(mesh, records, cut);
+        coarse.reduce(mesh, records, cut.into());
         coarse
     }
 
     /// The same, using again the memory that is there.
     #[inline(always)]
-    pub fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: f32) {
+    pub fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: MeshCut) {
         let fine = mesh.intrinsics;
         let coarse = fine.half();
         self.mesh.intrinsics = coarse;
@@ -158,7 +186,7 @@ impl Coarse {
 
 /// Means of the depths that are there; 0 where they are too few or not on one surface.
 #[inline(always)]
-fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: f32, coarse: &mut [f32]) {
+fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: MeshCut, coarse: &mut [f32]) {
     let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
     for (coarse, (upper, lower)) in coarse.iter_mut().zip(pairs) {
         let (mut count, mut sum, mut near, mut far) = (0.0, 0.0, f32::INFINITY, 0.0f32);
@@ -168,7 +196,7 @@ fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: f32, coarse: &mut [f32]) 
             near = near.min(if z > 0.0 { z } else { f32::INFINITY });
             far = far.max(z);
         }
-        let joined = (count >= COARSE_DEPTHS_MIN) & (far - near <= cut * near);
+        let joined = (count >= COARSE_DEPTHS_MIN) & cut.joins(near, far);
         *coarse = if joined { sum / count } else { 0.0 };
     }
 }

@@ -17,7 +17,7 @@ use crate::{
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::{Coarse, Mesh, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
         exposure::exposure_gain_on,
@@ -89,20 +89,20 @@ fn transform_kernel(rgb: &[u8], y: &mut [f32], cb: &mut [f32], cr: &mut [f32]) {
 }
 
 for_each_isa! {
-    fn join(mesh: &mut Mesh, cut: f32) = join_kernel;
+    fn join(mesh: &mut Mesh, cut: MeshCut) = join_kernel;
 }
 
 #[inline(always)]
-fn join_kernel(mesh: &mut Mesh, cut: f32) {
+fn join_kernel(mesh: &mut Mesh, cut: MeshCut) {
     mesh.join(cut);
 }
 
 for_each_isa! {
-    fn reduce(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: f32) = reduce_kernel;
+    fn reduce(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) = reduce_kernel;
 }
 
 #[inline(always)]
-fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: f32) {
+fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) {
     coarse.reduce(mesh, records, cut);
 }
 
@@ -164,7 +164,7 @@ impl CpuEngine {
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
-    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: f32) {
+    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
         join(self.isa, mesh, cut);
         reduce(self.isa, coarse, mesh, records, cut);
     }
