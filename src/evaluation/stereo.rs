@@ -7,6 +7,7 @@ use crate::{
         DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera,
     },
 };
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Three images of a rectified rig with equal distances, and what is true.
@@ -148,7 +149,7 @@ pub enum Cameras {
 
 /// Shares of pixels, percent. All are over the dense labelling: a pixel without depth counts by its best guess, but
 /// for `invalid`.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BadPixels {
     /// Wrong by more than one pixel between neighbouring cameras.
     pub bad_over_1px: f64,
