@@ -1,4 +1,10 @@
-//! Time of the hot path, whole and stage by stage.
+//! Time of the hot path, whole and stage by stage, beside the plain scalar `f64` reference and a read of the same memory.
+//!
+//! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
+//! pinned to one core then). `ISA=portable|avx2` chooses instructions. On a busy Xeon with AVX-512 (2.6 GHz), 320x240, 7
+//! views, one core, least of 8: `paper` 10.9 ms (recall 7.9, score 1.8, prepare 0.4, observe 0.1), the reference 159 ms,
+//! reading 1.5 ms; `robust` 17.4 ms (refine 3.3, recall 10.0, score 3.6). `peers.py`: remap of 70 planes 15.1 ms, MOG2 2.3
+//! ms, NumPy + SciPy 12.5 ms beside 11.5 ms.
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
