@@ -1,7 +1,6 @@
 //! A pipeline in its steady state, which overwrites a viewpoint with every frame, allocates nothing but the report's
 //! list of viewpoints and, with several threads, what the pool's queue takes.
 
-#[allow(dead_code)]
 mod reference;
 
 use std::{

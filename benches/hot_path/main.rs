@@ -190,13 +190,15 @@ impl Case {
                 .score(&work.prior, &work.observation, &mut work.score);
         });
         work.mesh.intrinsics = frame.intrinsics;
-        work.mesh.depth_m.clone_from(&frame.depth_m);
+        let depth_m = frame.depth.given_m().expect("the world measures depth");
+        work.mesh.depth_m.clear();
+        work.mesh.depth_m.extend_from_slice(depth_m);
         timed(prepare, || {
             work.engine.prepare(
                 &mut work.mesh,
                 &work.score.posterior,
                 &mut work.coarse,
-                settings.mesh_cut,
+                settings.mesh_cut.into(),
             );
         });
         timed(evidence, || {

@@ -3,7 +3,7 @@
 use nalgebra::{Point3, Vector3};
 use surprised::model::{
     camera::Intrinsics,
-    frame::Frame,
+    frame::{DepthSource, Frame},
     pose::{Pose, PoseNoise},
 };
 
@@ -94,8 +94,8 @@ impl World {
                     let noise = IMAGE_SD * random.normal();
                     *value = (f64::from(*value) + noise).round().clamp(0.0, 255.0) as u8;
                 }
-                if noisy_depth {
-                    for z in &mut frame.depth_m {
+                if let (true, DepthSource::Given(depth_m)) = (noisy_depth, &mut frame.depth) {
+                    for z in depth_m {
                         if *z > 0.0 {
                             let noise = INVERSE_DEPTH_SD * random.normal();
                             *z = (1.0 / (1.0 / f64::from(*z) + noise)) as f32;

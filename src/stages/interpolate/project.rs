@@ -521,12 +521,10 @@ fn four_corners(upper: &[f32], lower: &[f32], column: usize) -> [Lanes; 4] {
     let upper = &upper[column..column + LANES + 1];
     let lower = &lower[column..column + LANES + 1];
     let mut corners = [[0.0; LANES]; 4];
-    for lane in 0..LANES {
-        corners[0][lane] = upper[lane];
-        corners[1][lane] = upper[lane + 1];
-        corners[2][lane] = lower[lane];
-        corners[3][lane] = lower[lane + 1];
-    }
+    corners[0].copy_from_slice(&upper[..LANES]);
+    corners[1].copy_from_slice(&upper[1..=LANES]);
+    corners[2].copy_from_slice(&lower[..LANES]);
+    corners[3].copy_from_slice(&lower[1..=LANES]);
     corners
 }
 

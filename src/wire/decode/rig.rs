@@ -156,11 +156,14 @@ pub fn markers(markers: &proto::Markers) -> Result<Vec<Option<Point3<f64>>>, Ref
     Ok(tracked)
 }
 
+/// In the calibration's order, metres; `None` where the tracker does not see the marker.
+pub type MarkerPositions = Vec<Option<Point3<f64>>>;
+
 /// Time and markers from the `markers` key.
 ///
 /// # Errors
 /// Undecodable bytes, no stamp, senseless markers.
-pub fn markers_sample(bytes: &[u8]) -> Result<(i64, Vec<Option<Point3<f64>>>), Refusal> {
+pub fn markers_sample(bytes: &[u8]) -> Result<(i64, MarkerPositions), Refusal> {
     let sample: proto::Markers = message(bytes)?;
     let stamp_ns = required_stamp_ns(sample.stamp.as_ref())?;
     Ok((stamp_ns, markers(&sample)?))
