@@ -3,16 +3,16 @@
 
 use std::{collections::HashMap, sync::Arc};
 
+use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
-    engine::{
-        cpu::{CpuEngine, Observation, RecallView, Score},
-        isa::Isa,
-    },
+    engine::cpu::{CpuEngine, Observation, RecallView, Score},
+    isa::Isa,
     memory::{Memory, visit::Visit},
     model::{
+        belief::Record,
         camera::Intrinsics,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
         pose::{Pose, PoseNoise},
@@ -22,9 +22,12 @@ use crate::{
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
         depth::{InverseDepthRange, SidesDepth},
-        interpolate::prior::{self, Prior},
+        interpolate::{
+            merge::VIEWS_MAX,
+            prior::{self, Prior},
+        },
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
-        select::select_nearest,
+        select::select_into,
     },
 };
 
@@ -64,20 +67,20 @@ struct Camera {
     follower: Follower,
 }
 
-/// A frame compared with what was expected; nothing is learnt yet.
-struct Look {
-    world_from_camera: Pose,
-    selected: Vec<usize>,
-    depth: Depth,
-    camera: Camera,
-    report: Report,
-}
-
-/// The surface that a frame shows.
-struct Depth {
-    /// Metres; 0 = none, or out of the settings' range.
+/// Working memory between frames: what was overwritten is filled again.
+#[derive(Default)]
+struct Workspace {
+    /// Given or computed, checked, metres.
     depth_m: Vec<f32>,
-    cut: MeshCut,
+    /// What the memory expects where depth is computed: the prior, and its depth.
+    expected: Prior,
+    expected_m: Vec<f32>,
+    observation: Observation,
+    selected: Vec<usize>,
+    blocks: BlockMap,
+    mesh: Mesh,
+    records: Vec<Record>,
+    coarse: Coarse,
 }
 
 pub struct Pipeline {
@@ -85,13 +88,12 @@ pub struct Pipeline {
     pool: Arc<ThreadPool>,
     engine: CpuEngine,
     sides_depth: SidesDepth,
-    /// What is expected where depth is computed; kept for its allocation.
-    expected: Prior,
     refiner: PoseRefiner,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
     last_region_id: u64,
     maps: Maps,
+    workspace: Workspace,
 }
 
 impl Pipeline {
@@ -103,15 +105,15 @@ impl Pipeline {
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
         Self {
-            sides_depth: SidesDepth::new(depth_range(&settings)),
             engine: CpuEngine::new(&settings, pool.clone(), isa),
+            sides_depth: SidesDepth::new(depth_range(&settings), isa),
             pool,
-            expected: Prior::default(),
-            refiner: PoseRefiner::default(),
+            refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
             cameras: HashMap::new(),
             last_region_id: 0,
             maps: Maps::default(),
+            workspace: Workspace::default(),
             settings,
         }
     }
@@ -134,20 +136,44 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        let Look {
-            world_from_camera,
-            selected,
-            depth: Depth { depth_m, cut },
-            mut camera,
-            mut report,
-        } = self.look(frame)?;
-        let records = self.maps.score.posterior.clone();
-        let mesh = Mesh::new(frame.intrinsics, depth_m, cut);
+        let cut = self.depth(frame)?;
+        let mut camera = match self.cameras.get_mut(&frame.source) {
+            Some(camera) => std::mem::take(camera),
+            None => Camera::default(),
+        };
+        let mut report = self.look(frame, &mut camera.visit);
+        let id = self.remember(frame, &report.world_from_camera, cut);
+        camera.visit.wrote(id);
+        camera
+            .follower
+            .follow(&mut report.regions, &mut self.last_region_id);
+        match self.cameras.get_mut(&frame.source) {
+            Some(slot) => *slot = camera,
+            None => {
+                self.cameras.insert(frame.source.clone(), camera);
+            }
+        }
+        report.learned = true;
+        report.viewpoint_id = Some(id);
+        Ok(report)
+    }
+
+    /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
+    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose, cut: MeshCut) -> u64 {
+        let work = &mut self.workspace;
+        let mut mesh = std::mem::take(&mut work.mesh);
+        let mut coarse = std::mem::take(&mut work.coarse);
+        let mut records = std::mem::take(&mut work.records);
+        mesh.intrinsics = frame.intrinsics;
+        std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
+        records.clear();
+        records.extend_from_slice(&self.maps.score.posterior);
+        self.engine.prepare(&mut mesh, &records, &mut coarse, cut);
         let viewpoint = Viewpoint {
-            coarse: Coarse::new(&mesh, &records, cut),
+            coarse,
             id: 0,
-            world_from_camera,
-            world_from_home: world_from_camera,
+            world_from_camera: *world_from_camera,
+            world_from_home: *world_from_camera,
             mesh,
             records,
             source: frame.source.clone(),
@@ -155,20 +181,18 @@ impl Pipeline {
             updates: 0,
         };
         let slot = self.memory.slot(
-            &selected,
-            &world_from_camera,
+            &work.selected,
+            world_from_camera,
             viewpoint.bytes(),
             &self.settings,
         );
-        let id = self.memory.write(slot, viewpoint);
-        camera.visit.wrote(id);
-        camera
-            .follower
-            .follow(&mut report.regions, &mut self.last_region_id);
-        self.cameras.insert(frame.source.clone(), camera);
-        report.learned = true;
-        report.viewpoint_id = Some(id);
-        Ok(report)
+        let (id, old) = self.memory.replace(slot, viewpoint);
+        if let Some(old) = old {
+            work.mesh = old.mesh;
+            work.coarse = old.coarse;
+            work.records = old.records;
+        }
+        id
     }
 
     /// Compares a frame with the memory and changes nothing but [`Self::maps`]. Its regions have no ids.
@@ -176,12 +200,18 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.look(frame).map(|look| look.report)
+        self.depth(frame)?;
+        let camera = self.cameras.get(&frame.source);
+        let mut visit = camera
+            .map(|camera| camera.visit.clone())
+            .unwrap_or_default();
+        Ok(self.look(frame, &mut visit))
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
     pub fn prior(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> PriorAt {
-        let selected = self.select(world_from_camera);
+        let mut selected = Vec::new();
+        self.select(world_from_camera, &mut selected);
         let mut prior = Prior::default();
         let views = recall_views(&self.memory, &self.settings, &selected, &Visit::default());
         self.engine
@@ -197,20 +227,20 @@ impl Pipeline {
         self.cameras.remove(source);
     }
 
-    fn look(&mut self, frame: &Frame) -> Result<Look, FrameError> {
-        let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
-        let depth = self.depth(frame, &camera.visit)?;
-        let observation = Observation::new(&frame.image);
+    /// Compares a checked frame with what is expected; nothing is learnt yet.
+    fn look(&mut self, frame: &Frame, visit: &mut Visit) -> Report {
+        let mut work = std::mem::take(&mut self.workspace);
+        let mut maps = std::mem::take(&mut self.maps);
+        self.engine.observe(&frame.image, &mut work.observation);
 
-        let refined = self.refine(frame, &observation, &camera.visit);
+        let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
         let world_from_camera = refined.world_from_camera;
 
-        let selected = self.select(&world_from_camera);
-        let used = self.ids(&selected);
-        camera.visit.select(&used);
+        self.select(&world_from_camera, &mut work.selected);
+        let used = self.ids(&work.selected);
+        visit.select(&used);
 
-        let mut maps = std::mem::take(&mut self.maps);
-        let views = recall_views(&self.memory, &self.settings, &selected, &camera.visit);
+        let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
         self.engine.recall(
             &views,
             &frame.intrinsics,
@@ -218,16 +248,17 @@ impl Pipeline {
             &mut maps.prior,
         );
         self.engine
-            .score(&maps.prior, &observation, &mut maps.score);
+            .score(&maps.prior, &work.observation, &mut maps.score);
         maps.intrinsics = Some(frame.intrinsics);
-        maps.evidence = BlockMap::evidence(
+        maps.evidence.find(
             &maps.score.surprise,
             frame.intrinsics.width,
             self.settings.evidence,
+            &mut work.blocks,
         );
 
         let scene = Scene {
-            depth_m: &depth.depth_m,
+            depth_m: &work.depth_m,
             intrinsics: &frame.intrinsics,
             world_from_camera: &world_from_camera,
         };
@@ -262,16 +293,17 @@ impl Pipeline {
             pose_correction_rad: refined.correction_rad,
         };
         self.maps = maps;
-        Ok(Look {
-            world_from_camera,
-            selected,
-            depth,
-            camera,
-            report,
-        })
+        self.workspace = work;
+        report
     }
 
-    fn refine(&mut self, frame: &Frame, observation: &Observation, visit: &Visit) -> Refined {
+    fn refine(
+        &mut self,
+        frame: &Frame,
+        observation: &Observation,
+        visit: &Visit,
+        selected: &mut Vec<usize>,
+    ) -> Refined {
         if !self.settings.refine_pose {
             return Refined::unchanged(frame.world_from_camera);
         }
@@ -279,10 +311,10 @@ impl Pipeline {
             position_m: self.settings.pose_position_sd_m,
             rotation_rad: self.settings.pose_rotation_sd_rad,
         });
-        let mut selected = self.select(&frame.world_from_camera);
+        self.select(&frame.world_from_camera, selected);
         selected.truncate(REFINE_VIEWS);
-        let recalled = recall_views(&self.memory, &self.settings, &selected, visit);
-        let views: Vec<(&Coarse, &Pose, f32)> = recalled
+        let recalled = recall_views(&self.memory, &self.settings, selected, visit);
+        let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = recalled
             .iter()
             .map(|view| {
                 (
@@ -301,19 +333,20 @@ impl Pipeline {
         )
     }
 
-    fn select(&self, world_from_camera: &Pose) -> Vec<usize> {
+    fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {
         let poses = self
             .memory
             .viewpoints()
             .iter()
             .map(|viewpoint| &viewpoint.world_from_camera);
-        select_nearest(
+        select_into(
             poses,
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
             self.settings.view_distance_max_m,
-        )
+            selected,
+        );
     }
 
     fn ids(&self, selected: &[usize]) -> Vec<u64> {
@@ -323,8 +356,9 @@ impl Pipeline {
             .collect()
     }
 
-    /// The frame's depth, given or computed, with everything outside the settings' range taken as none.
-    fn depth(&mut self, frame: &Frame, visit: &Visit) -> Result<Depth, FrameError> {
+    /// Whether a frame can be used; its depth, given or computed, everything outside the settings' range taken as none,
+    /// goes into the workspace. Returns where its mesh is to be cut.
+    fn depth(&mut self, frame: &Frame) -> Result<MeshCut, FrameError> {
         let Intrinsics { width, height, .. } = frame.intrinsics;
         if (frame.image.width, frame.image.height) != (width, height) {
             return Err(FrameError::ImageSize {
@@ -335,48 +369,21 @@ impl Pipeline {
             });
         }
         match &frame.depth {
-            DepthSource::Given(depth_m) => Ok(Depth {
-                depth_m: self.checked_depth(depth_m, width * height)?,
-                cut: self.settings.mesh_cut.into(),
-            }),
-            DepthSource::Sides(sides) => self.depth_from_sides(frame, sides, visit),
+            DepthSource::Given(depth_m) => {
+                if depth_m.len() != width * height {
+                    return Err(FrameError::DepthSize {
+                        got: depth_m.len(),
+                        expected: width * height,
+                    });
+                }
+                check(depth_m, &self.settings, &mut self.workspace.depth_m)?;
+                Ok(self.settings.mesh_cut.into())
+            }
+            DepthSource::Sides(sides) => self.depth_from_sides(frame, sides),
         }
     }
 
-    fn checked_depth(&self, depth_m: &[f32], pixels: usize) -> Result<Vec<f32>, FrameError> {
-        if depth_m.len() != pixels {
-            return Err(FrameError::DepthSize {
-                got: depth_m.len(),
-                expected: pixels,
-            });
-        }
-        let range = self.settings.depth_min_m..=self.settings.depth_max_m;
-        let mut given: Vec<f32> = depth_m
-            .iter()
-            .copied()
-            .filter(|z| z.is_finite() && *z > 0.0)
-            .collect();
-        enough(given.len(), pixels)?;
-        let valid = given.iter().filter(|z| range.contains(z)).count() as f64 / given.len() as f64;
-        if valid < DEPTH_IN_RANGE_MIN {
-            let middle = given.len() / 2;
-            let (_, &mut median_m, _) = given.select_nth_unstable_by(middle, f32::total_cmp);
-            return Err(FrameError::DepthUnit {
-                valid_percent: 100.0 * valid,
-                min_m: *range.start(),
-                max_m: *range.end(),
-                median_m,
-            });
-        }
-        Ok(in_range(&self.settings, depth_m))
-    }
-
-    fn depth_from_sides(
-        &mut self,
-        frame: &Frame,
-        sides: &Sides,
-        visit: &Visit,
-    ) -> Result<Depth, FrameError> {
+    fn depth_from_sides(&mut self, frame: &Frame, sides: &Sides) -> Result<MeshCut, FrameError> {
         for (side, view) in [("left", &sides.left), ("right", &sides.right)] {
             let (got, camera) = (&view.image, &view.intrinsics);
             if (got.width, got.height) != (camera.width, camera.height) {
@@ -398,52 +405,75 @@ impl Pipeline {
                 most: DEPTH_COSTS_MAX,
             });
         }
-        let expected_m = self.expected_depth(frame, visit);
+        let mut work = std::mem::take(&mut self.workspace);
+        let expects = self.expect_depth(frame, &mut work);
+        let expected_m = expects.then_some(work.expected_m.as_slice());
         let image = frame.image.grey();
-        let computed = self.pool.install(|| {
-            self.sides_depth
-                .compute(&frame.intrinsics, &image, sides, expected_m.as_deref())
-        });
-        let (inverse_depth, computed_m) = (computed.label_step * LABELS_JOINED, &computed.depth_m);
-        enough(computed_m.iter().filter(|z| **z > 0.0).count(), pixels)?;
-        Ok(Depth {
-            depth_m: in_range(&self.settings, computed_m),
-            cut: MeshCut {
-                share: self.settings.mesh_cut,
-                inverse_depth,
-            },
-        })
+        let (pool, sides_depth) = (&self.pool, &mut self.sides_depth);
+        let computed =
+            pool.install(|| sides_depth.compute(&frame.intrinsics, &image, sides, expected_m));
+        let checked = check(&computed.depth_m, &self.settings, &mut work.depth_m);
+        let cut = MeshCut {
+            share: self.settings.mesh_cut,
+            inverse_depth: computed.label_step * LABELS_JOINED,
+        };
+        self.workspace = work;
+        checked.map(|()| cut)
     }
 
-    /// What the memory expects from the frame's pose as it was given: good enough where the images say nothing.
-    fn expected_depth(&mut self, frame: &Frame, visit: &Visit) -> Option<Vec<f32>> {
-        let selected = self.select(&frame.world_from_camera);
-        if selected.is_empty() {
-            return None;
+    /// What the memory expects from the frame's pose as it was given: good enough where the images say nothing. False
+    /// where it remembers nothing.
+    fn expect_depth(&mut self, frame: &Frame, work: &mut Workspace) -> bool {
+        self.select(&frame.world_from_camera, &mut work.selected);
+        if work.selected.is_empty() {
+            return false;
         }
-        let views = recall_views(&self.memory, &self.settings, &selected, visit);
+        let stranger = Visit::default();
+        let camera = self.cameras.get(&frame.source);
+        let visit = camera.map_or(&stranger, |camera| &camera.visit);
+        let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
         self.engine.recall(
             &views,
             &frame.intrinsics,
             &frame.world_from_camera,
-            &mut self.expected,
+            &mut work.expected,
         );
-        Some(self.expected.plane(prior::DEPTH).collect())
+        work.expected_m.clear();
+        work.expected_m.extend(work.expected.plane(prior::DEPTH));
+        true
     }
 }
 
-fn in_range(settings: &Settings, depth_m: &[f32]) -> Vec<f32> {
-    let range = settings.depth_min_m..=settings.depth_max_m;
-    // NaN is in no range.
-    let kept = |&z: &f32| if range.contains(&z) { z } else { 0.0 };
-    depth_m.iter().map(kept).collect()
-}
-
-fn enough(valid: usize, pixels: usize) -> Result<(), FrameError> {
-    let share = valid as f64 / pixels as f64;
+/// Takes what is outside the settings' range as none, and refuses what is useless then.
+fn check(depth_m: &[f32], settings: &Settings, checked_m: &mut Vec<f32>) -> Result<(), FrameError> {
+    let (min_m, max_m) = (settings.depth_min_m, settings.depth_max_m);
+    let is_given = |z: f32| z.is_finite() & (z > 0.0);
+    checked_m.resize(depth_m.len(), 0.0);
+    let (mut given, mut valid) = (0u32, 0u32);
+    for (checked, &z) in checked_m.iter_mut().zip(depth_m) {
+        // NaN is in no range.
+        let in_range = (z >= min_m) & (z <= max_m);
+        given += u32::from(is_given(z));
+        valid += u32::from(in_range);
+        *checked = if in_range { z } else { 0.0 };
+    }
+    let share = f64::from(given) / depth_m.len() as f64;
     if share < DEPTH_SHARE_MIN {
         return Err(FrameError::NoDepth {
             valid_percent: 100.0 * share,
+        });
+    }
+    let valid = f64::from(valid) / f64::from(given);
+    if valid < DEPTH_IN_RANGE_MIN {
+        let given = depth_m.iter().copied().filter(|&z| is_given(z));
+        let mut given: Vec<f32> = given.collect();
+        let middle = given.len() / 2;
+        let (_, &mut median_m, _) = given.select_nth_unstable_by(middle, f32::total_cmp);
+        return Err(FrameError::DepthUnit {
+            valid_percent: 100.0 * valid,
+            min_m,
+            max_m,
+            median_m,
         });
     }
     Ok(())
@@ -465,7 +495,7 @@ fn recall_views<'a>(
     settings: &Settings,
     selected: &[usize],
     visit: &Visit,
-) -> Vec<RecallView<'a>> {
+) -> ArrayVec<RecallView<'a>, VIEWS_MAX> {
     selected
         .iter()
         .map(|&index| {

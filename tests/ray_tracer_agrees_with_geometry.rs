@@ -320,8 +320,8 @@ fn a_mask_is_the_same_before_and_while_the_thing_stands() {
     builder.primitives.extend(thing);
     let after = scene(&Scene::new(builder.primitives));
     let mut seen = 0;
-    for at in 0..would.len() {
-        let would_be = would[at].is_finite() && would[at] <= before.depth_m[at];
+    for (at, would) in would.iter().enumerate() {
+        let would_be = would.is_finite() && *would <= before.depth_m[at];
         let is = after.object[at] == THING;
         assert_eq!(would_be, is, "pixel {at}");
         seen += usize::from(is);

@@ -1,6 +1,10 @@
 //! How the program is started: one file a command.
 
+pub mod demo;
+
 pub mod evaluate;
+
+pub mod fleet;
 
 pub mod options;
 
@@ -9,6 +13,8 @@ pub mod query;
 pub mod replay;
 
 pub mod serve;
+
+pub mod simulate;
 
 use clap::{Parser, Subcommand};
 
@@ -24,7 +30,9 @@ pub struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Demo(demo::Demo),
     Serve(serve::Serve),
+    Simulate(simulate::Simulate),
     Replay(replay::Replay),
     Evaluate(evaluate::EvaluateArgs),
     Query(query::Query),
@@ -35,7 +43,9 @@ impl Arguments {
     /// Whatever made the command fail; [`exit_code`] says which kind.
     pub async fn run(self) -> anyhow::Result<()> {
         match self.command {
+            Command::Demo(demo) => demo.run().await,
             Command::Serve(serve) => serve.run().await,
+            Command::Simulate(simulate) => simulate.run().await,
             Command::Replay(replay) => replay.run().await,
             Command::Evaluate(evaluate) => evaluate::run(evaluate),
             Command::Query(query) => query.run().await,

@@ -52,7 +52,7 @@ pub struct Replay {
 }
 
 /// A name that can be a chunk of a key.
-fn id(text: &str) -> Result<String, String> {
+pub fn id(text: &str) -> Result<String, String> {
     if is_id(text) {
         Ok(text.to_owned())
     } else {

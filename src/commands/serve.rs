@@ -18,14 +18,22 @@ impl Serve {
     /// # Errors
     /// As [`service::serve`].
     pub async fn run(self) -> anyhow::Result<()> {
-        let mut interrupt = signal(SignalKind::interrupt())?;
-        let mut terminate = signal(SignalKind::terminate())?;
-        let stop = async move {
-            tokio::select! {
-                _ = interrupt.recv() => tracing::info!("SIGINT: stopping"),
-                _ = terminate.recv() => tracing::info!("SIGTERM: stopping"),
-            }
-        };
+        let stop = stop_signal()?;
         Ok(service::serve(self.options.options()?, stop).await?)
     }
+}
+
+/// Ends when the process is told to stop.
+///
+/// # Errors
+/// Signals that cannot be listened to.
+pub fn stop_signal() -> std::io::Result<impl Future<Output = ()>> {
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => tracing::info!("SIGINT: stopping"),
+            _ = terminate.recv() => tracing::info!("SIGTERM: stopping"),
+        }
+    })
 }

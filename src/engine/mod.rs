@@ -1,5 +1,3 @@
 //! Where interpolation and surprise are computed.
 
-pub mod isa;
-
 pub mod cpu;

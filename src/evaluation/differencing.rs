@@ -10,11 +10,9 @@ use rayon::ThreadPool;
 
 use crate::{
     config::{Evidence, Settings},
-    engine::{
-        cpu::{CpuEngine, Observation, RecallView},
-        isa::Isa,
-    },
+    engine::cpu::{CpuEngine, Observation, RecallView},
     evaluation::method::Verdict,
+    isa::Isa,
     memory::Memory,
     model::{
         belief::{Belief, CHANNELS, Record},

@@ -5,7 +5,7 @@ use nalgebra::{Matrix3, Point3};
 use super::pose::Pose;
 
 /// Of a rectified image: `u = fx * x/z + cx`, pixels.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Intrinsics {
     pub width: usize,
     pub height: usize,

@@ -119,6 +119,10 @@ pub struct Waiting {
 }
 
 /// Whether a waiting frame's turn can come.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one is made and taken apart a frame"
+)]
 pub enum Turn {
     Ready(Pose, PackedFrame),
     /// Look again then, or when something has come.

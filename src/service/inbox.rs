@@ -105,6 +105,10 @@ pub struct Delivery {
     pub closed: bool,
 }
 
+/// An ask that found no place in the queue.
+#[derive(Debug)]
+pub struct NotAsked;
+
 impl Inbox {
     fn lock(&self) -> MutexGuard<'_, State> {
         // Nothing below panics between two changes that belong together.
@@ -177,12 +181,12 @@ impl Inbox {
     }
 
     /// # Errors
-    /// The ask itself, when the queue is full or the place is closing.
-    pub fn put_ask(&self, ask: Ask) -> Result<(), Ask> {
+    /// When the queue is full or the place is closing.
+    pub fn put_ask(&self, ask: Ask) -> Result<(), NotAsked> {
         let mut state = self.lock();
         if state.closed || state.asks.len() == ASKS_MAX {
             state.asks_busy += 1;
-            return Err(ask);
+            return Err(NotAsked);
         }
         state.asks.push_back(ask);
         drop(state);

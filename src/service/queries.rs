@@ -183,10 +183,7 @@ async fn reply_to(
 /// `busy`, or whatever the worker says.
 pub async fn ask<T>(place: &Place, make: impl FnOnce(Answer<T>) -> Ask) -> Result<T, Refusal> {
     let (sender, answer) = oneshot::channel();
-    place
-        .inbox
-        .put_ask(make(sender))
-        .map_err(|_refused| busy())?;
+    place.inbox.put_ask(make(sender)).map_err(|_full| busy())?;
     answer
         .await
         .unwrap_or_else(|_| Err(Refusal::new("closing", "the service is stopping")))

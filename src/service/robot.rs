@@ -6,6 +6,7 @@ use std::time::Duration;
 use tokio::{sync::mpsc, time::timeout};
 use zenoh::{
     Session,
+    bytes::Encoding,
     liveliness::LivelinessToken,
     pubsub::{Publisher, Subscriber},
     qos::CongestionControl,
@@ -68,6 +69,7 @@ pub enum RobotError {
 /// One camera of a robot with a session of its own. Gone from the network when dropped.
 pub struct Robot {
     frames: Publisher<'static>,
+    truth: Publisher<'static>,
     answers: mpsc::Receiver<Answer>,
     _subscribers: [Subscriber<()>; 2],
     _token: LivelinessToken,
@@ -113,9 +115,14 @@ impl Robot {
             // Raw depth is larger than Zenoh's queue: what may be dropped would be, also on an idle network.
             .congestion_control(CongestionControl::Block)
             .await?;
+        let truth = session
+            .declare_publisher(path.key(root, keys::TRUTH))
+            .encoding(Encoding::APPLICATION_JSON)
+            .await?;
         let token = session.liveliness().declare_token(path.live(root)).await?;
         Ok(Self {
             frames,
+            truth,
             answers,
             _subscribers: subscribers,
             _token: token,
@@ -188,6 +195,14 @@ impl Robot {
             });
         }
         Ok(self.frames.put(encode::bytes(&message)).await?)
+    }
+
+    /// What a simulated robot knows to be there, beside its frames.
+    ///
+    /// # Errors
+    /// A closed session.
+    pub async fn publish_truth(&self, truth: &serde_json::Value) -> Result<(), RobotError> {
+        Ok(self.truth.put(truth.to_string()).await?)
     }
 
     /// The next answer; `None` if none comes in time.

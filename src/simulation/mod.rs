@@ -34,3 +34,5 @@ pub mod sensor;
 pub mod script;
 
 pub mod write;
+
+pub mod judge;

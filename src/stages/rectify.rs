@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn a_dot_moves_to_where_a_pinhole_camera_draws_it() {
         let lens = PlumbBob {
-            k1: -0.2,
+            k1: -0.45,
             k2: 0.05,
             p1: 0.003,
             p2: -0.002,

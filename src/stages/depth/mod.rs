@@ -16,7 +16,7 @@ pub use messages::Belief;
 pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
 pub use sides::SidesDepth;
 
-use crate::engine::isa::Isa;
+use crate::isa::Isa;
 use plane_sweep::{Middle, Side, Sweep};
 use rayon::prelude::*;
 
