@@ -1,13 +1,13 @@
 //! The surprise daemon: remembers how places look and notices when they look different.
 //!
 //! ```text
-//! robot ──Zenoh──> ingest ─> decode ─> localise ─> recall ─> surprise ─> attend ─> publish ──Zenoh──> consumers
-//!                  newest    checks    pose and    select 7, update,     blocks,   reports,
-//!                  wins                rectified   inter-    KL map      regions   maps on demand
-//!                                                  polate
-//!                                                    ^          │
-//!                                                    └─ viewpoint memory <─ remember (grow or replace)
-//!                                                              │
+//! robot ──Zenoh──> ingest ─> decode ─> localise ─> depth ─> recall ─> surprise ─> attend ─> publish ──Zenoh──> consumers
+//!                  newest    checks    pose or     given    select 7, update,     blocks,   reports,
+//!                  wins                markers,    or 3     inter-    KL map      regions   maps on demand
+//!                                      rectified   cameras  polate
+//!                                                             ^          │
+//!                                                             └─ viewpoint memory <─ remember (grow or replace)
+//!                                                                       │
 //!                                           prior / evaluate / views queries, HTTP
 //! ```
 //!

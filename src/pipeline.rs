@@ -102,6 +102,7 @@ impl Pipeline {
         Self {
             sides_depth: SidesDepth::new(depth_range(&settings)),
             engine: CpuEngine::new(&settings, pool.clone(), isa),
+            sides_depth: SidesDepth::new(depth_range(&settings), isa),
             pool,
             refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
@@ -137,7 +138,7 @@ impl Pipeline {
             None => Camera::default(),
         };
         let mut report = self.look(frame, &mut camera.visit);
-        let id = self.remember(frame, &report.world_from_camera);
+        let id = self.remember(frame, &report.world_from_camera, cut);
         camera.visit.wrote(id);
         camera
             .follower
@@ -154,7 +155,7 @@ impl Pipeline {
     }
 
     /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
-    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose) -> u64 {
+    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose, cut: MeshCut) -> u64 {
         let work = &mut self.workspace;
         let mut mesh = std::mem::take(&mut work.mesh);
         let mut coarse = std::mem::take(&mut work.coarse);

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::{
+    isa::Isa,
     model::frame::{SideView, Sides},
     simulation::{
         room::is_on_cloth,
@@ -72,7 +73,7 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
         .names()
         .find(|(name, _)| *name == "glass")
         .map(|(_, id)| id);
-    let mut depth = SidesDepth::new(range);
+    let mut depth = SidesDepth::new(range, Isa::detect());
     let [mut others, mut cloth, mut glass, mut behind, mut invalid]: [Share; 5] =
         std::array::from_fn(|_| Share::default());
     let mut errors: Vec<f32> = Vec::new();

@@ -88,6 +88,10 @@ pub struct SideView {
     pub middle_from_side: Pose,
 }
 
+/// Where a tracker sees the markers of a plate, in its calibration's order: metres, world; `None` for what it does not
+/// see.
+pub type MarkersInWorld = Vec<Option<Point3<f64>>>;
+
 /// What a rig of three cameras with a tracked plate sends: neither depth nor pose, but what both follow from.
 #[derive(Debug, Clone)]
 pub struct RigFrame {
@@ -97,8 +101,7 @@ pub struct RigFrame {
     pub image: RgbImage,
     pub left: GreyImage,
     pub right: GreyImage,
-    /// Metres, in the calibration's order; `None` where the tracker does not see the marker.
-    pub marker_in_world: Vec<Option<Point3<f64>>>,
+    pub marker_in_world: MarkersInWorld,
 }
 
 /// Decoded, checked and undistorted; image and depth have the size that `intrinsics` says.

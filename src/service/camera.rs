@@ -17,7 +17,10 @@ use super::{
 use crate::{
     model::{
         camera::{RigCalibration, SideCalibration},
-        frame::{DepthSource, Frame, FrameError, GreyImage, RgbImage, SideView, Sides, Source},
+        frame::{
+            DepthSource, Frame, FrameError, GreyImage, MarkersInWorld, RgbImage, SideView, Sides,
+            Source,
+        },
         pose::{Pose, PoseNoise},
         refusal::Refusal,
     },
@@ -53,7 +56,7 @@ pub struct Camera {
     pub waiting: Option<Waiting>,
     calibration: Option<Arc<Lenses>>,
     /// Markers whose plate is not known yet: stamps and positions in the world.
-    markers: VecDeque<(i64, Markers)>,
+    markers: VecDeque<(i64, MarkersInWorld)>,
     calibration_asked: Option<Instant>,
     order: StampOrder,
     /// Sequence of the last frame that could be read, refused or not.
@@ -63,8 +66,6 @@ pub struct Camera {
     watched_until: Option<Instant>,
     watchers: Vec<Answer<Arc<Snapshot>>>,
 }
-
-type Markers = Vec<Option<Point3<f64>>>;
 
 /// A calibration with the maps that follow from it.
 #[derive(Debug)]
@@ -201,7 +202,7 @@ impl Camera {
     }
 
     /// Takes a sample of the `markers` key; [`Self::fit_markers`] makes a pose of it.
-    pub fn put_markers(&mut self, stamp_ns: i64, marker_in_world: Markers) {
+    pub fn put_markers(&mut self, stamp_ns: i64, marker_in_world: MarkersInWorld) {
         if self.markers.len() == POSES_MAX {
             self.markers.pop_front();
         }

@@ -2,9 +2,12 @@
 //! In: luminance of the middle camera, what its sides saw. Out: as [`DepthEstimator`].
 
 use super::{DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera};
-use crate::model::{
-    camera::Intrinsics,
-    frame::{GreyImage, SideView, Sides},
+use crate::{
+    isa::Isa,
+    model::{
+        camera::Intrinsics,
+        frame::{GreyImage, SideView, Sides},
+    },
 };
 
 /// Rigs whose tables and buffers are kept; robots of one make share theirs. Each takes some bytes a pixel and label.
@@ -12,21 +15,19 @@ const RIGS_MAX: usize = 4;
 
 /// Estimators of the rigs that were seen last.
 pub struct SidesDepth {
+    isa: Isa,
     range: InverseDepthRange,
     /// The latest at the end.
     estimators: Vec<(DepthRig, DepthEstimator)>,
 }
 
 impl SidesDepth {
-    pub fn new(range: InverseDepthRange) -> Self {
+    pub fn new(range: InverseDepthRange, isa: Isa) -> Self {
         Self {
+            isa,
             range,
             estimators: Vec::new(),
         }
-    }
-
-    pub fn range(&self) -> &InverseDepthRange {
-        &self.range
     }
 
     /// `middle` is the image's camera; all images have their cameras' sizes. `expected_depth_m` as for
@@ -54,7 +55,7 @@ impl SidesDepth {
                 if self.estimators.len() == RIGS_MAX {
                     self.estimators.remove(0);
                 }
-                DepthEstimator::new(DepthSettings::default())
+                DepthEstimator::with_isa(DepthSettings::default(), self.isa)
             }
         };
         self.estimators.push((rig, estimator));

@@ -5,7 +5,6 @@ pub mod image;
 
 mod rig;
 
-use nalgebra::Point3;
 use prost::Message;
 use prost_types::Timestamp;
 
@@ -16,7 +15,7 @@ use crate::{
     config::Settings,
     model::{
         camera::{Calibration, Intrinsics, PlumbBob, RigCalibration},
-        frame::{GreyImage, RgbImage},
+        frame::{GreyImage, MarkersInWorld, RgbImage},
         pose::{Pose, PoseNoise, pose_from_parts},
         refusal::Refusal,
     },
@@ -58,8 +57,7 @@ pub struct PackedFrame {
     pub sequence: u64,
     pub world_from_camera: Option<Pose>,
     pub pose_noise: Option<PoseNoise>,
-    /// Metres, in the calibration's order; `None` for what the tracker does not see.
-    pub marker_in_world: Option<Vec<Option<Point3<f64>>>>,
+    pub marker_in_world: Option<MarkersInWorld>,
     pub calibration: Option<RigCalibration>,
     image: proto::Image,
     depth: PackedDepth,

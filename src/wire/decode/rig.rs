@@ -6,6 +6,7 @@ use super::{POSITION_MAX_M, intrinsics, message, pose, required_stamp_ns};
 use crate::{
     model::{
         camera::{Plate, RigCalibration, SideCalibration, SideCalibrations},
+        frame::MarkersInWorld,
         pose::Pose,
         refusal::Refusal,
     },
@@ -123,7 +124,7 @@ fn point(vector: &proto::Vector3) -> Point3<f64> {
 }
 
 /// In the world, metres; `None` for what is not visible.
-pub fn markers(markers: &proto::Markers) -> Result<Vec<Option<Point3<f64>>>, Refusal> {
+pub fn markers(markers: &proto::Markers) -> Result<MarkersInWorld, Refusal> {
     let refusal = |detail: String| Err(Refusal::new("markers", detail));
     if markers.markers.len() > MARKERS_MAX {
         return refusal(format!(
@@ -131,7 +132,7 @@ pub fn markers(markers: &proto::Markers) -> Result<Vec<Option<Point3<f64>>>, Ref
             markers.markers.len()
         ));
     }
-    let tracked: Vec<Option<Point3<f64>>> = markers
+    let tracked: MarkersInWorld = markers
         .markers
         .iter()
         .filter(|marker| !marker.visible || marker.position.is_some())
