@@ -100,9 +100,8 @@ impl Pipeline {
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
         Self {
-            sides_depth: SidesDepth::new(depth_range(&settings)),
-            engine: CpuEngine::new(&settings, pool.clone(), isa),
             sides_depth: SidesDepth::new(depth_range(&settings), isa),
+            engine: CpuEngine::new(&settings, pool.clone(), isa),
             pool,
             refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
@@ -138,7 +137,7 @@ impl Pipeline {
             None => Camera::default(),
         };
         let mut report = self.look(frame, &mut camera.visit);
-        let id = self.remember(frame, &report.world_from_camera, cut);
+        let id = self.remember(frame, &report.world_from_camera);
         camera.visit.wrote(id);
         camera
             .follower
@@ -155,7 +154,7 @@ impl Pipeline {
     }
 
     /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
-    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose, cut: MeshCut) -> u64 {
+    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose) -> u64 {
         let work = &mut self.workspace;
         let mut mesh = std::mem::take(&mut work.mesh);
         let mut coarse = std::mem::take(&mut work.coarse);
