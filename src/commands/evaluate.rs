@@ -17,6 +17,7 @@ use anyhow::Context;
 use nalgebra::Point3;
 use rayon::ThreadPool;
 use serde::Serialize;
+use tempfile::TempDir;
 
 use crate::{
     config::{Evidence, Preset, Settings},
@@ -28,13 +29,15 @@ use crate::{
         summary::{BoxSummary, Headline, ObjectSummary, PassSummary, boxes, headline, passes},
         table::{Table, number},
     },
+    simulation::{script::Script, write},
 };
 
 /// Judge settings on a recording with truth, beside image differencing.
 #[derive(Debug, clap::Args)]
 pub struct EvaluateArgs {
-    /// A recording in TUM RGB-D layout, or a folder of them (runs of one place, in the order of their names).
-    #[arg(required_unless_present = "depth")]
+    /// A recording in TUM RGB-D layout, or a folder of them (runs of one place, in the order of their names), or
+    /// `simulated`: the paper's experiment in the simulated world.
+    #[arg(required_unless_present = "depth", value_name = "DIR|simulated")]
     dir: Option<PathBuf>,
     /// Judge computed depth instead, on a folder with left.png, middle.png, right.png and disparity.png (value / 16 =
     /// pixels), or `simulated`: frames of the tabletop script.
@@ -96,6 +99,15 @@ impl FromStr for Ball {
     }
 }
 
+/// The paper's sequence I1 as its robot records it, in a folder that goes when it is dropped.
+fn simulate(seed: u64) -> anyhow::Result<TempDir> {
+    let folder = tempfile::tempdir().context("no temporary folder can be made")?;
+    let script = Script::tabletop(seed);
+    let options = write::Options::whole(&script, u64::MAX);
+    write::recording(folder.path(), &script, &options)?;
+    Ok(folder)
+}
+
 /// One line of the tables.
 struct Trial {
     name: &'static str,
@@ -135,7 +147,11 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         .dir
         .as_deref()
         .context("name a recording to evaluate, or --depth")?;
-    let recordings = dataset::open(dir)?;
+    // Dropped, and so removed, at the end.
+    let simulated = (dir == Path::new("simulated"))
+        .then(|| simulate(arguments.seed))
+        .transpose()?;
+    let recordings = dataset::open(simulated.as_ref().map_or(dir, |folder| folder.path()))?;
     if let Some(folder) = &arguments.figures {
         fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     }
