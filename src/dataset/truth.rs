@@ -88,10 +88,12 @@ impl Truth {
                 evaluated: (!fields[4].is_empty()).then(|| fields[4].to_owned()),
             })?
         } else if folder.join("passes.csv").is_file() {
-            moments(&folder.join("passes.csv"), entries, 2, |fields| Moment {
+            let mut passes = moments(&folder.join("passes.csv"), entries, 2, |fields| Moment {
                 pass: fields[1].to_owned(),
                 ..Moment::default()
-            })?
+            })?;
+            split_at_turns(&mut passes, entries);
+            passes
         } else {
             Vec::new()
         };
@@ -184,6 +186,34 @@ fn moments(
                 })
         })
         .collect()
+}
+
+/// What a pass is called from where it turns back.
+pub const WAY_BACK: &str = " back";
+
+/// A pass that ends nearer to its start than halfway to its farthest pose goes there and back: its second half sees
+/// nothing for the first time and gets a name of its own.
+fn split_at_turns(moments: &mut [Moment], entries: &[Entry]) {
+    let mut start = 0;
+    for pass in moments.chunk_by_mut(|a, b| a.pass == b.pass) {
+        let from_start_m: Vec<f64> = entries[start..start + pass.len()]
+            .iter()
+            .map(|entry| {
+                let first = &entries[start].world_from_camera.translation.vector;
+                (entry.world_from_camera.translation.vector - first).norm()
+            })
+            .collect();
+        let turn = (0..pass.len())
+            .max_by(|&a, &b| from_start_m[a].total_cmp(&from_start_m[b]))
+            .expect("a chunk is not empty");
+        let comes_back = from_start_m[pass.len() - 1] < from_start_m[turn] / 2.0;
+        start += pass.len();
+        if comes_back {
+            for moment in &mut pass[turn + 1..] {
+                moment.pass.push_str(WAY_BACK);
+            }
+        }
+    }
 }
 
 fn masks(

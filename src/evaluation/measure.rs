@@ -55,6 +55,8 @@ pub struct FrameRow {
     /// Counts the passes: frames with one number belong together.
     pub group: usize,
     pub object: Option<ObjectScore>,
+    /// The blocks behind [`Self::object`].
+    pub sides: Sides,
     /// Of the blocks outside every mask and whatever is ignored.
     pub largest_outside: f64,
     /// The same of all blocks but the ignored.
@@ -160,7 +162,7 @@ pub fn measure(
             let ignored = ignored_pixels(&frame, &conditions.ignored);
             let (largest, largest_outside) =
                 largest_blocks(recording, index, &frame, &verdict, &ignored, settings)?;
-            let object = object_score(
+            let (object, sides) = object_score(
                 recording, index, &frame, method, &verdict, settings, &moment,
             )?;
             let boxes = recording.truth.boxes.get(index).map(|boxes| {
@@ -178,6 +180,7 @@ pub fn measure(
                 moment,
                 group,
                 object,
+                sides,
                 largest_outside,
                 largest,
                 threshold: f64::from(method.threshold()),
@@ -207,13 +210,13 @@ fn object_score(
     verdict: &Verdict,
     settings: &Settings,
     moment: &Moment,
-) -> Result<Option<ObjectScore>, DatasetError> {
+) -> Result<(Option<ObjectScore>, Sides), DatasetError> {
     let Intrinsics { width, height, .. } = frame.intrinsics;
     let Some(object) = &moment.evaluated else {
-        return Ok(None);
+        return Ok((None, Sides::default()));
     };
     let Some(mask) = recording.truth.mask(object, index, (width, height))? else {
-        return Ok(None);
+        return Ok((None, Sides::default()));
     };
     let sides = Sides::new(&verdict.evidence, &mask, width, settings.border_px);
     let (Some(auc), Some(precision)) = (
@@ -221,12 +224,12 @@ fn object_score(
         average_precision(&sides.inside, &sides.outside),
     ) else {
         // In the border strip.
-        return Ok(None);
+        return Ok((None, Sides::default()));
     };
     let iou = mask_box(&mask, width)
         .zip(verdict.best_box(frame, settings))
         .map_or(0.0, |(truth, found)| truth.iou(&found));
-    Ok(Some(ObjectScore {
+    let score = ObjectScore {
         as_db: sides.selectivity_db(),
         pas_db: sides.peak_selectivity_db(),
         mean_inside: sides.mean_inside(),
@@ -236,7 +239,8 @@ fn object_score(
         average_precision: precision,
         iou,
         error_grey: method.error_in(frame, verdict.gain, &mask),
-    }))
+    };
+    Ok((Some(score), sides))
 }
 
 /// Of all blocks, and of those outside every object's mask.

@@ -11,3 +11,7 @@ pub mod method;
 pub mod measure;
 
 pub mod summary;
+
+pub mod figures;
+
+pub mod table;

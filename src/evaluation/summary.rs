@@ -4,7 +4,8 @@ use serde::Serialize;
 
 use super::{
     measure::{FrameRow, ObjectScore},
-    selectivity::score_ratio_db,
+    ranking::{average_precision, roc_auc},
+    selectivity::{Sides, score_ratio_db},
 };
 
 /// The passes of a recording have these names in `phases.csv`; the first of a phase goes forward.
@@ -36,6 +37,7 @@ pub struct ObjectSummary {
     pub frames: usize,
     pub as_db: f64,
     pub pas_db: f64,
+    /// Of the blocks of all frames together, so that one threshold must serve the whole pass.
     pub auc: f64,
     pub average_precision: f64,
     pub iou: f64,
@@ -146,13 +148,21 @@ fn object_summary(rows: &[FrameRow]) -> Option<ObjectSummary> {
         .iter()
         .filter_map(|(_, score)| score.error_grey)
         .collect();
+    let pooled = |side: fn(&Sides) -> &Vec<f32>| -> Vec<f32> {
+        rows.iter()
+            .flat_map(|row| side(&row.sides))
+            .copied()
+            .collect()
+    };
+    let inside = pooled(|sides| &sides.inside);
+    let outside = pooled(|sides| &sides.outside);
     Some(ObjectSummary {
         name,
         frames: scored.len(),
         as_db: mean(&|score| score.as_db),
         pas_db: mean(&|score| score.pas_db),
-        auc: mean(&|score| score.auc),
-        average_precision: mean(&|score| score.average_precision),
+        auc: roc_auc(&inside, &outside)?,
+        average_precision: average_precision(&inside, &outside)?,
         iou: mean(&|score| score.iou),
         mean_inside: mean(&|score| score.mean_inside),
         max_inside: mean(&|score| score.max_inside),
@@ -163,6 +173,42 @@ fn object_summary(rows: &[FrameRow]) -> Option<ObjectSummary> {
             .filter(|(row, score)| score.max_inside > row.threshold)
             .count(),
     })
+}
+
+/// Regions against boxes, over all frames that were compared with a memory.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct BoxSummary {
+    pub images: usize,
+    pub wanted: usize,
+    pub found: usize,
+    pub false_regions: usize,
+    pub taken_away: usize,
+}
+
+impl BoxSummary {
+    pub fn recall(&self) -> f64 {
+        self.found as f64 / self.wanted as f64
+    }
+
+    pub fn false_per_image(&self) -> f64 {
+        self.false_regions as f64 / self.images as f64
+    }
+}
+
+/// Of the runs after the first; `None` without boxes.
+pub fn boxes(rows: &[FrameRow]) -> Option<BoxSummary> {
+    let first_run = &rows.first()?.run;
+    let mut sum = BoxSummary::default();
+    for (row, score) in rows.iter().filter_map(|row| Some((row, row.boxes?))) {
+        if row.run != *first_run {
+            sum.images += 1;
+            sum.wanted += score.wanted;
+            sum.found += score.found;
+            sum.false_regions += score.false_regions;
+            sum.taken_away += score.taken_away;
+        }
+    }
+    (sum.images > 0).then_some(sum)
 }
 
 /// Of sorted values; between two of them the line that joins them.

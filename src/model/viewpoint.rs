@@ -30,18 +30,16 @@ impl Mesh {
             z_min > 0.0 && z_max - z_min <= cut * z_min
         };
         let mut mask = Vec::with_capacity(width.saturating_sub(1) * height.saturating_sub(1));
-        for (upper, lower) in depth_m
-            .chunks_exact(width)
-            .zip(depth_m.chunks_exact(width).skip(1))
-        {
+        // Half of a camera one pixel wide has no column, and no row then.
+        let rows = || depth_m.chunks_exact(width.max(1));
+        for (upper, lower) in rows().zip(rows().skip(1)) {
             for (upper, lower) in upper.windows(2).zip(lower.windows(2)) {
                 let upper_left = joined(upper[0], upper[1], lower[0]);
                 let lower_right = joined(lower[1], lower[0], upper[1]);
                 mask.push(u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT);
             }
         }
-        let row_depth_m = depth_m
-            .chunks_exact(width)
+        let row_depth_m = rows()
             .map(|row| {
                 row.iter()
                     .filter(|&&z| z > 0.0)
