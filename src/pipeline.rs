@@ -1,13 +1,14 @@
 //! The only file that knows the order of the stages. One pipeline is one place; a plain function from frame to report:
 //! no clock, no network, no locks.
 
-use std::{collections::HashMap, sync::Arc};
+use std::{cell::OnceCell, collections::HashMap, sync::Arc};
 
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
     engine::{
+        Engine, Question,
         cpu::{CpuEngine, Observation, RecallView, Score},
         isa::Isa,
     },
@@ -21,7 +22,7 @@ use crate::{
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
-        interpolate::prior::{self, Prior},
+        interpolate::prior::Prior,
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
         select::select_nearest,
     },
@@ -68,12 +69,16 @@ struct Look {
 
 pub struct Pipeline {
     settings: Settings,
-    engine: CpuEngine,
+    engine: Engine,
     refiner: PoseRefiner,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
     last_region_id: u64,
+    /// What the last frame's report needed.
     maps: Maps,
+    /// All of them, if the engine kept some and somebody wanted them.
+    whole_maps: OnceCell<Maps>,
+    maps_read: bool,
 }
 
 impl Pipeline {
@@ -84,13 +89,21 @@ impl Pipeline {
 
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+        let engine = Engine::Cpu(CpuEngine::new(&settings, pool, isa));
+        Self::with_engine(settings, engine)
+    }
+
+    /// With an engine that was made for these settings.
+    pub fn with_engine(settings: Settings, engine: Engine) -> Self {
         Self {
-            engine: CpuEngine::new(&settings, pool, isa),
+            engine,
             refiner: PoseRefiner::default(),
             memory: Memory::default(),
             cameras: HashMap::new(),
             last_region_id: 0,
             maps: Maps::default(),
+            whole_maps: OnceCell::new(),
+            maps_read: true,
             settings,
         }
     }
@@ -105,7 +118,28 @@ impl Pipeline {
 
     /// Of the last frame that was processed or evaluated.
     pub fn maps(&self) -> &Maps {
-        &self.maps
+        if self.maps_read {
+            return &self.maps;
+        }
+        self.whole_maps.get_or_init(|| {
+            let mut maps = Maps {
+                intrinsics: self.maps.intrinsics,
+                evidence: self.maps.evidence.clone(),
+                ..Maps::default()
+            };
+            maps.score.gain = self.maps.score.gain;
+            match self.engine.maps(&mut maps.prior, &mut maps.score) {
+                Ok(()) => maps,
+                Err(error) => {
+                    tracing::warn!(%error, "the last frame's maps are gone");
+                    Maps::default()
+                }
+            }
+        })
+    }
+
+    pub fn engine(&self) -> &Engine {
+        &self.engine
     }
 
     /// Compares a frame with the memory and learns it.
@@ -119,7 +153,7 @@ impl Pipeline {
             depth_m,
             mut camera,
             mut report,
-        } = self.look(frame)?;
+        } = self.look(frame, true)?;
         let records = self.maps.score.posterior.clone();
         let mesh = Mesh::new(frame.intrinsics, depth_m, self.settings.mesh_cut);
         let viewpoint = Viewpoint {
@@ -140,6 +174,9 @@ impl Pipeline {
             &self.settings,
         );
         let id = self.memory.write(slot, viewpoint);
+        let written = self.memory.viewpoints().iter().find(|view| view.id == id);
+        self.engine
+            .remember(written.expect("it was written just now"));
         camera.visit.wrote(id);
         camera
             .follower
@@ -155,7 +192,7 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.look(frame).map(|look| look.report)
+        self.look(frame, false).map(|look| look.report)
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
@@ -171,7 +208,7 @@ impl Pipeline {
         }
     }
 
-    fn look(&mut self, frame: &Frame) -> Result<Look, FrameError> {
+    fn look(&mut self, frame: &Frame, learn: bool) -> Result<Look, FrameError> {
         let depth_m = self.checked_depth(frame)?;
         let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
         let observation = Observation::new(&frame.image);
@@ -185,20 +222,22 @@ impl Pipeline {
 
         let mut maps = std::mem::take(&mut self.maps);
         let views = recall_views(&self.memory, &self.settings, &selected, &camera.visit);
-        self.engine.recall(
-            &views,
-            &frame.intrinsics,
-            &world_from_camera,
-            &mut maps.prior,
-        );
-        self.engine
-            .score(&maps.prior, &observation, &mut maps.score);
+        let question = Question {
+            views: &views,
+            intrinsics: &frame.intrinsics,
+            world_from_camera: &world_from_camera,
+            image: &frame.image,
+            observation: &observation,
+        };
+        let evidence = self.settings.evidence;
+        let compared = self
+            .engine
+            .compare(&question, evidence, learn, &mut maps.prior, &mut maps.score)
+            .map_err(|error| FrameError::Engine(error.to_string()))?;
         maps.intrinsics = Some(frame.intrinsics);
-        maps.evidence = BlockMap::evidence(
-            &maps.score.surprise,
-            frame.intrinsics.width,
-            self.settings.evidence,
-        );
+        maps.evidence = compared.evidence;
+        self.maps_read = compared.maps_read;
+        self.whole_maps.take();
 
         let scene = Scene {
             depth_m: &depth_m,
@@ -213,11 +252,6 @@ impl Pipeline {
             sum += f64::from(value);
             max = max.max(value);
         }
-        let seen = maps
-            .prior
-            .plane(prior::COVERAGE)
-            .filter(|&c| c > 0.0)
-            .count();
         let report = Report {
             source: frame.source.clone(),
             stamp_ns: frame.stamp_ns,
@@ -228,7 +262,7 @@ impl Pipeline {
             regions,
             max_surprise: max,
             mean_surprise: (sum / count.max(1) as f64) as f32,
-            coverage: seen as f32 / frame.intrinsics.pixels() as f32,
+            coverage: compared.seen as f32 / frame.intrinsics.pixels() as f32,
             learned: false,
             viewpoint_id: None,
             viewpoints_used: used,

@@ -66,6 +66,8 @@ pub enum FrameError {
         max_m: f32,
         median_m: f32,
     },
+    #[error("the frame could not be computed: {0}")]
+    Engine(String),
 }
 
 impl FrameError {
@@ -76,6 +78,7 @@ impl FrameError {
             Self::DepthSize { .. } => "depth_size",
             Self::NoDepth { .. } => "no_depth",
             Self::DepthUnit { .. } => "depth_unit",
+            Self::Engine(_) => "engine",
         }
     }
 }

@@ -108,6 +108,11 @@ impl<'a> Projector<'a> {
         }
     }
 
+    /// H and h.
+    pub fn homography(&self) -> (&Matrix3<f64>, &Vector3<f64>) {
+        (&self.h_matrix, &self.h_offset)
+    }
+
     /// Draws what falls into rows `strip` of the target. `map` is that strip, `strip.len() * width` samples, and keeps
     /// the nearer of what it holds and what is drawn.
     #[inline(always)]
