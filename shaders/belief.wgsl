@@ -23,6 +23,14 @@ const SPREAD_MAX: f32 = 65504.0;
 /// 2^-112: the difference of the exponent biases of f16 and f32.
 const BIAS_SCALE_INVERSE: f32 = 1.925929944387236e-34;
 
+/// 2^112.
+const BIAS_SCALE: f32 = 5.192296858534828e33;
+
+/// Two non-negative halves.
+fn unpack_spread(word: u32) -> vec2<f32> {
+    return vec2<f32>(bitcast<f32>((word & 0xffffu) << 13u), bitcast<f32>((word >> 16u) << 13u)) * BIAS_SCALE;
+}
+
 /// Nearest f16 of a value that f16 holds with full precision, or of 0; ties to even. `pack2x16float` may round another way.
 fn f16_from_f32(value: f32) -> u32 {
     let bits = bitcast<u32>(value * BIAS_SCALE_INVERSE);

@@ -58,10 +58,10 @@ fn gather(view: View, u: f32, v: f32) -> Gathered {
     for (var i = 0u; i < 3u; i++) {
         let spread = record_arena[2u * corners[i]];
         let level = record_arena[2u * corners[i] + 1u];
-        let spread_0 = unpack2x16float(spread.x);
-        let spread_1 = unpack2x16float(spread.y);
-        let spread_2 = unpack2x16float(spread.z);
-        let spread_3 = unpack2x16float(spread.w);
+        let spread_0 = unpack_spread(spread.x);
+        let spread_1 = unpack_spread(spread.y);
+        let spread_2 = unpack_spread(spread.z);
+        let spread_3 = unpack_spread(spread.w);
         let level_0 = unpack_level(level.x);
         let level_1 = unpack_level(level.y);
         let level_2 = unpack_level(level.z);

@@ -19,11 +19,11 @@ fn gamma_at(alpha0: f32) -> f32 {
 
 /// Per channel the parts of the surprise that need no logarithm, the ratio of beta and that of sigma.
 fn channel_terms(alpha: f32, prior: Channel, posterior: Channel, deviation: f32) -> vec3<f32> {
-    let precision = alpha / posterior.beta;
+    let expected_precision = alpha / posterior.beta;
     // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
     let moved = posterior.sigma * deviation;
-    let plain = (prior.beta - posterior.beta) * precision
-        + (moved * moved * precision + posterior.sigma) / (2.0 * prior.sigma) - 0.5;
+    let plain = (prior.beta - posterior.beta) * expected_precision
+        + (moved * moved * expected_precision + posterior.sigma) / (2.0 * prior.sigma) - 0.5;
     return vec3<f32>(plain, posterior.beta / prior.beta, prior.sigma / posterior.sigma);
 }
 

@@ -42,7 +42,10 @@ fn every_shader_file_is_part_of_a_pass() {
         for entry in std::fs::read_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(folder)).unwrap()
         {
             let path = entry.unwrap().path();
-            if path.extension().is_some_and(|extension| extension == "wgsl") {
+            if path
+                .extension()
+                .is_some_and(|extension| extension == "wgsl")
+            {
                 let text = std::fs::read_to_string(&path).unwrap();
                 assert!(
                     PASSES.iter().any(|pass| pass.source.contains(&text)),
@@ -236,10 +239,12 @@ fn all_rust_constants() -> BTreeMap<String, Vec<f64>> {
     }
     // Not written as numbers there.
     found.insert("LOG2_E".into(), vec![std::f64::consts::LOG2_E]);
+    found.insert("BIAS_SCALE".into(), vec![2f64.powi(112)]);
     found.insert("BIAS_SCALE_INVERSE".into(), vec![2f64.powi(-112)]);
-    found.insert("LEVEL_OFFSET_Y".into(), vec![
-        surprised::model::belief::LEVEL_OFFSET[0].into(),
-    ]);
+    found.insert(
+        "LEVEL_OFFSET_Y".into(),
+        vec![surprised::model::belief::LEVEL_OFFSET[0].into()],
+    );
     found.insert("PIXELS_PER_THREAD".into(), vec![EXPOSE_PIXELS.into()]);
     found.insert("THREADS".into(), vec![PASSES[EXPOSE].workgroup[0].into()]);
     found.insert("VIEWS_MAX".into(), vec![VIEWS_MAX as f64]);

@@ -104,9 +104,8 @@ impl Arenas {
     pub fn place(&mut self, device: &Device, viewpoint: &Viewpoint) -> Option<Place> {
         let before = self.residency.capacity();
         let pixels = viewpoint.mesh.depth_m.len() as u64;
-        let place = self
-            .residency
-            .place(viewpoint.id, viewpoint.updates, pixels);
+        let version = (viewpoint.updates, viewpoint.stamp_ns);
+        let place = self.residency.place(viewpoint.id, version, pixels);
         if self.residency.capacity() > before {
             let (depth, records) = Self::buffers(device, self.residency.capacity());
             let mut encoder =

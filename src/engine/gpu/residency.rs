@@ -4,10 +4,14 @@
 /// Depth and record.
 pub const BYTES_PER_PIXEL: u64 = 4 + 32;
 
+/// What tells a viewpoint from what it was before or, in a memory that began anew, from another of its name: how often
+/// it was updated, and when it was written.
+pub type Version = (u64, i64);
+
 #[derive(Debug, Clone, Copy)]
 struct Held {
     id: u64,
-    updates: u64,
+    version: Version,
     first: u64,
     pixels: u64,
     /// In which recall it was last used.
@@ -71,14 +75,14 @@ impl Residency {
         self.held.clear();
     }
 
-    /// Room for a viewpoint as it is after so many updates; `None`: there is none beside the others of this recall.
-    pub fn place(&mut self, id: u64, updates: u64, pixels: u64) -> Option<Place> {
+    /// Room for a viewpoint; `None`: there is none beside the others of this recall.
+    pub fn place(&mut self, id: u64, version: Version, pixels: u64) -> Option<Place> {
         if let Some(index) = self.held.iter().position(|held| held.id == id) {
             let held = &mut self.held[index];
             if held.pixels == pixels {
                 held.used = self.recall;
-                let current = held.updates == updates;
-                held.updates = updates;
+                let current = held.version == version;
+                held.version = version;
                 return Some(if current {
                     Place::Held(held.first)
                 } else {
@@ -105,7 +109,7 @@ impl Residency {
         };
         self.held.push(Held {
             id,
-            updates,
+            version,
             first,
             pixels,
             used: self.recall,
