@@ -129,7 +129,12 @@ fn same_pixels(a: &Prior, b: &Prior) -> f64 {
     let same = (0..a.width * a.height)
         .filter(|pixel| {
             let (x, y) = (pixel % a.width, pixel / a.width);
+            // tau2 means nothing where p2 is 0.
+            let nothing = b.row(y).plane(prior::P2)[x] == 0.0;
             (0..prior::PLANES).all(|plane| {
+                if nothing && (prior::TAU2..prior::P2).contains(&plane) {
+                    return true;
+                }
                 let (a, b) = (a.row(y).plane(plane)[x], b.row(y).plane(plane)[x]);
                 // A step of the position, where colours are smooth, is worth less than this.
                 (a - b).abs() <= 0.05 + 2e-3 * b.abs()
