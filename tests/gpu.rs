@@ -118,7 +118,7 @@ fn the_prior_is_that_of_the_reference_from_none_to_seven_views() {
                 assert!(same >= 0.995, "{name}: only {same} as on the processor");
             }
         }
-        assert_eq!(on_gpu(&engine).counters().frames_on_processor, 0);
+        assert_eq!(on_gpu(&engine).counters().on_processor, 0);
         assert_eq!(on_gpu(&engine).counters().losses, 0);
     }
 }

@@ -62,8 +62,8 @@ use crate::{
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Counters {
     pub frames: u64,
-    /// Frames that did not fit the device.
-    pub frames_on_processor: u64,
+    /// Frames and recalls that the processor did because the device could not.
+    pub on_processor: u64,
     pub passes: u64,
     pub uploaded_bytes: u64,
     pub read_back_bytes: u64,
@@ -165,7 +165,7 @@ impl GpuEngine {
             )
         })?;
         let Some(report) = report else {
-            self.counters.frames_on_processor += 1;
+            self.counters.on_processor += 1;
             let evidence = self.settings.evidence;
             return Ok(compare_on_processor(
                 &self.processor,
@@ -194,6 +194,7 @@ impl GpuEngine {
         });
         // Whoever asks for a prior gets one, with or without a device.
         if !matches!(done, Ok(Some(()))) {
+            self.counters.on_processor += 1;
             self.processor
                 .recall(views, intrinsics, world_from_camera, prior);
         }
