@@ -15,6 +15,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         out.join("descriptors.bin"),
         prost::Message::encode_to_vec(&descriptors),
     )?;
-    prost_build::Config::new().compile_fds(descriptors)?;
+    prost_build::Config::new()
+        // Encodings and replies in JSON need the messages' names.
+        .enable_type_names()
+        .compile_fds(descriptors)?;
     Ok(())
 }

@@ -296,6 +296,14 @@ impl Settings {
 pub enum ConfigError {
     #[error("settings: {0}")]
     File(toml::de::Error),
+    #[error("{file}: {error}")]
+    Read { file: String, error: std::io::Error },
+    #[error(
+        "--root {0}: a root is a Zenoh key without wildcards, such as surprised or site/surprised"
+    )]
+    Root(String),
+    #[error("Zenoh: {0}")]
+    Zenoh(String),
     #[error("--set {0}: write it as name=value")]
     Pair(String),
     #[error(

@@ -1,29 +1,27 @@
-use std::process::ExitCode;
+//! Arguments -> one call -> exit code.
 
-use clap::{Parser, Subcommand};
-use surprised::commands::evaluate::{self, EvaluateArgs};
+use std::{io::IsTerminal, process::ExitCode};
 
-#[derive(Parser)]
-#[command(version, about)]
-struct Arguments {
-    #[command(subcommand)]
-    command: Command,
-}
+use clap::Parser;
+use surprised::commands::{Arguments, exit_code};
+use tracing_subscriber::EnvFilter;
 
-#[derive(Subcommand)]
-enum Command {
-    Evaluate(EvaluateArgs),
-}
-
-fn main() -> ExitCode {
-    let result = match Arguments::parse().command {
-        Command::Evaluate(arguments) => evaluate::run(arguments),
-    };
-    match result {
+#[tokio::main]
+async fn main() -> ExitCode {
+    let arguments = Arguments::parse();
+    // RUST_LOG says what is logged; standard output belongs to answers.
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("surprised=info")),
+        )
+        .with_ansi(std::io::stderr().is_terminal())
+        .with_writer(std::io::stderr)
+        .init();
+    match arguments.run().await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("surprised: {error:#}");
-            ExitCode::FAILURE
+            ExitCode::from(exit_code(&error))
         }
     }
 }

@@ -208,6 +208,11 @@ impl Pipeline {
         }
     }
 
+    /// Forgets what is known about a camera beside the viewpoints it wrote.
+    pub fn forget(&mut self, source: &Source) {
+        self.cameras.remove(source);
+    }
+
     fn look(&mut self, frame: &Frame, learn: bool) -> Result<Look, FrameError> {
         let depth_m = self.checked_depth(frame)?;
         let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();

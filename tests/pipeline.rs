@@ -282,6 +282,8 @@ fn what_evaluate_says_is_what_processing_would_have_said() {
     assert_eq!(expected, processed);
 }
 
+type Spoil = Box<dyn Fn(&mut Frame)>;
+
 #[test]
 fn rejected_frames_change_nothing_and_say_why() {
     let mut plain = Robot::new(Settings::robust());
@@ -289,7 +291,7 @@ fn rejected_frames_change_nothing_and_say_why() {
     for step in 0..STEPS {
         let here = arc(step, 0.0);
         let good = frame(&place(false), &here, 700);
-        let bad: [(&str, Box<dyn Fn(&mut Frame)>); 6] = [
+        let bad: [(&str, Spoil); 6] = [
             ("image_size", Box::new(|frame| frame.image.width -= 1)),
             ("depth_size", Box::new(|frame| frame.depth_m.truncate(100))),
             ("no_depth", Box::new(|frame| frame.depth_m.fill(0.0))),

@@ -14,13 +14,18 @@ use surprised::{
 
 const PIXELS: usize = 4000;
 const FRAMES: usize = 400;
+/// Frames until the start is forgotten.
+const SETTLED: usize = 100;
+/// Share of the mean surprise; levels of an eighth, as f16 has them at 200, change it by 8 %.
+const DIFFERENCE_MAX: f64 = 0.01;
 const NOISE_SD: f64 = 1.5;
 
-fn mean_surprise(settings: &Settings, grey: f32, stored: bool) -> f64 {
+/// Mean surprise of exact beliefs and of stored ones that see the same, and the mean size of their difference, nats.
+fn surprises(settings: &Settings, grey: f32) -> (f64, f64, f64) {
     let rules = UpdateRules::new(settings);
     let gamma = GammaTerm::new(&rules);
     let mut random = Random(11);
-    let level = [grey, 20.0, -35.0];
+    let level = [grey, 20.3, -35.7];
     let start = Belief {
         alpha: 1.3,
         beta: [130.0; CHANNELS],
@@ -28,41 +33,44 @@ fn mean_surprise(settings: &Settings, grey: f32, stored: bool) -> f64 {
         sigma: [0.8; CHANNELS],
         ..Belief::default()
     };
-    let mut beliefs = vec![start; PIXELS];
-    let mut sum = 0.0;
+    let mut beliefs = vec![(start, Record::pack(&start)); PIXELS];
+    let (mut exact_sum, mut stored_sum, mut difference) = (0.0, 0.0, 0.0);
     for frame in 0..FRAMES {
-        for belief in &mut beliefs {
+        for (exact, record) in &mut beliefs {
             let x = level.map(|value| value + (NOISE_SD * random.normal()) as f32);
-            let posterior = rules.belief(belief, x);
-            if frame >= FRAMES / 4 {
-                sum += f64::from(surprise(belief, &posterior, x, &gamma));
+            let stored = record.unpack();
+            let posterior = rules.belief(&stored, x);
+            let exact_posterior = rules.belief(exact, x);
+            if frame >= SETTLED {
+                let stored_nats = f64::from(surprise(&stored, &posterior, x, &gamma));
+                let exact_nats = f64::from(surprise(exact, &exact_posterior, x, &gamma));
+                exact_sum += exact_nats;
+                stored_sum += stored_nats;
+                difference += (stored_nats - exact_nats).abs();
             }
-            *belief = if stored {
-                Record::pack(&posterior).unpack()
-            } else {
-                posterior
-            };
+            *record = Record::pack(&posterior);
+            *exact = exact_posterior;
         }
     }
-    sum / (PIXELS * FRAMES * 3 / 4) as f64
+    let count = (PIXELS * (FRAMES - SETTLED)) as f64;
+    (exact_sum / count, stored_sum / count, difference / count)
 }
 
 #[test]
-fn storing_every_posterior_changes_the_mean_surprise_by_less_than_a_percent() {
-    for preset in [Preset::Paper, Preset::Robust] {
-        for grey in [12.37, 200.61] {
-            let settings = Settings::preset(preset);
-            let exact = mean_surprise(&settings, grey, false);
-            let stored = mean_surprise(&settings, grey, true);
-            let change = (stored / exact - 1.0).abs();
-            println!(
-                "{preset:?} at {grey}: {exact:.4} nats, stored {stored:.4}, {:.3} %",
-                100.0 * change
-            );
-            assert!(
-                change < 0.01,
-                "{preset:?} at {grey}: {exact} became {stored}"
-            );
-        }
+fn storing_every_posterior_hardly_changes_the_surprise() {
+    for (preset, grey) in [(Preset::Paper, 12.37), (Preset::Robust, 200.61)] {
+        let (exact, stored, difference) = surprises(&Settings::preset(preset), grey);
+        let change = (stored / exact - 1.0).abs();
+        println!(
+            "{preset:?} at {grey}: {exact:.4} nats, {:.3} % in the mean, {:.3} % a pixel",
+            100.0 * change,
+            100.0 * difference / exact
+        );
+        assert!(change < 0.01, "{preset:?}: {exact} became {stored}");
+        // Coarser levels hide in the mean but not here.
+        assert!(
+            difference < DIFFERENCE_MAX * exact,
+            "{difference} of {exact}"
+        );
     }
 }

@@ -1,4 +1,7 @@
 //! `evaluate`: how good settings are on recordings with truth, beside image differencing.
+//!
+//! In the recording `revisit` a TV changes by itself: `--ignore-world 0.58,-1.42,2.90,0.5` leaves it out. The ball lies
+//! around its bezel, placed by the depth there at 2004.43 s; the screen itself has no depth and is never predicted.
 
 use std::{
     fmt::Write as _,
@@ -189,8 +192,11 @@ fn beside_differencing(settings: &Settings) -> Vec<Trial> {
     .into()
 }
 
+/// The settings with one step less.
+type TurnOff = fn(&mut Settings);
+
 fn leave_one_out(settings: &Settings) -> Vec<Trial> {
-    let steps: [(&str, fn(&mut Settings)); 11] = [
+    let steps: [(&str, TurnOff); 11] = [
         ("preset", |_| ()),
         ("- refine_pose", |s| s.refine_pose = false),
         ("- fresh_views", |s| s.fresh_views = false),

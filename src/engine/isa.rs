@@ -1,11 +1,11 @@
 //! Which instructions the hot loops are compiled for, chosen when the service starts.
 
 /// Ordered: each includes the ones before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Isa {
     /// What the target guarantees: SSE2 on x86-64, NEON on aarch64.
     Portable,
-    /// AVX2, FMA, BMI2: x86-64 processors since 2013.
+    /// AVX2, FMA, BMI2, F16C: x86-64 processors since 2013.
     Avx2,
     /// AVX-512 F, BW, DQ, VL.
     Avx512,
@@ -18,7 +18,8 @@ impl Isa {
         {
             let avx2 = is_x86_feature_detected!("avx2")
                 && is_x86_feature_detected!("fma")
-                && is_x86_feature_detected!("bmi2");
+                && is_x86_feature_detected!("bmi2")
+                && is_x86_feature_detected!("f16c");
             let avx512 = is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx512dq")
@@ -31,6 +32,20 @@ impl Isa {
         }
         #[cfg(not(target_arch = "x86_64"))]
         Self::Portable
+    }
+
+    /// Every one that this processor has, so that tests can compare them.
+    pub fn available() -> impl Iterator<Item = Self> {
+        let best = Self::detect();
+        [Self::Portable, Self::Avx2, Self::Avx512]
+            .into_iter()
+            .filter(move |isa| *isa <= best)
+    }
+
+    /// This one, or the best that the processor has if it lacks it: the only way from a wish to an `Isa` that may be
+    /// dispatched on.
+    pub fn or_best_available(self) -> Self {
+        self.min(Self::detect())
     }
 }
 

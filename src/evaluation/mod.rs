@@ -15,3 +15,5 @@ pub mod summary;
 pub mod figures;
 
 pub mod table;
+
+pub mod stereo;

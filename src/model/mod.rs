@@ -8,6 +8,8 @@ pub mod frame;
 
 pub mod pose;
 
+pub mod refusal;
+
 pub mod report;
 
 pub mod viewpoint;

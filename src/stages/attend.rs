@@ -309,7 +309,7 @@ fn mismatch(old: &Region, new: &Region) -> Option<f64> {
         }
         _ => {
             let iou = old.pixel_box.iou(&new.pixel_box);
-            (iou > SAME_IOU).then(|| 1.0 - iou)
+            (iou > SAME_IOU).then_some(1.0 - iou)
         }
     }
 }

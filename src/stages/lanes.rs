@@ -28,7 +28,7 @@ pub fn ln(x: f32) -> f32 {
     p = p * m - 1.666_805_7e-1;
     p = p * m + 2.000_071_5e-1;
     p = p * m - 2.499_999_4e-1;
-    p = p * m + 3.333_333_1e-1;
+    p = p * m + 3.333_333e-1;
     let square = m * m;
     let tail = p * m * square + exponent * LN2_LOW - 0.5 * square;
     exponent * LN2_HIGH + (m + tail)

@@ -1,5 +1,15 @@
 //! What is computed, in the order of a frame's way. Plain functions over values and rows; they know `model` alone.
 
+pub mod stamp_order;
+
+pub mod pose_track;
+
+pub mod rectify;
+
+pub mod localise;
+
+pub mod depth;
+
 pub mod select;
 
 pub mod refine;

@@ -142,12 +142,12 @@ pub fn surprise(
 ) -> f32 {
     let mut plain = 0.0;
     let (mut beta_ratios, mut sigma_ratios) = (1.0, 1.0);
-    for c in 0..CHANNELS {
+    for (c, observed) in observed.into_iter().enumerate() {
         let (p, b, s) = channel_terms(
             posterior.alpha,
             (prior.beta[c], prior.sigma[c]),
             (posterior.beta[c], posterior.sigma[c]),
-            observed[c] - prior.tau[c],
+            observed - prior.tau[c],
         );
         plain += p;
         beta_ratios *= b;

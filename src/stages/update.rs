@@ -74,10 +74,10 @@ impl UpdateRules {
             alpha: self.alpha(prior.alpha),
             ..*prior
         };
-        for c in 0..CHANNELS {
+        for (c, observed) in observed.into_iter().enumerate() {
             let channel = (prior.beta[c], prior.tau[c], prior.sigma[c]);
             (posterior.beta[c], posterior.tau[c], posterior.sigma[c]) =
-                self.channel(prior.alpha, channel, observed[c]);
+                self.channel(prior.alpha, channel, observed);
         }
         posterior
     }

@@ -1,0 +1,82 @@
+//! `surprised simulate`: robots in a simulated world, over Zenoh like real ones, or written to a folder.
+
+use std::path::PathBuf;
+
+use anyhow::bail;
+use tokio::sync::watch;
+
+use super::{
+    fleet::{self, Network, PaceOptions, WorldOptions},
+    replay::id,
+};
+use crate::{service::session::ZenohOptions, simulation::write};
+
+/// Frames written of an endless script unless --frames says otherwise: one and a half minutes.
+const WRITTEN_MAX: u64 = 630;
+
+/// Drives simulated robots around a table with known truth
+#[derive(Debug, clap::Args)]
+pub struct Simulate {
+    #[command(flatten)]
+    world: WorldOptions,
+    #[command(flatten)]
+    pace: PaceOptions,
+    /// Send measured depth, as a depth camera does.
+    #[arg(long)]
+    depth: bool,
+    /// Write the first robot's recording to this folder in TUM RGB-D layout, with masks, instead of publishing.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["rate", "lockstep"])]
+    write: Option<PathBuf>,
+    /// The place the robots say they are in.
+    #[arg(long, value_parser = id, default_value = "kitchen")]
+    place: String,
+    /// Print one last line of JSON.
+    #[arg(long)]
+    json: bool,
+    /// The Zenoh key below which everything is.
+    #[arg(long, value_name = "KEY", default_value = "surprised")]
+    root: String,
+    #[command(flatten)]
+    zenoh: ZenohOptions,
+}
+
+impl Simulate {
+    /// Until the script's frames are over, or SIGINT or SIGTERM.
+    ///
+    /// # Errors
+    /// A folder that cannot be written, or as [`fleet::drive`].
+    pub async fn run(self) -> anyhow::Result<()> {
+        let script = self.world.script();
+        if let Some(folder) = self.write {
+            let options = write::Options::whole(
+                &script,
+                self.world
+                    .frames
+                    .unwrap_or(WRITTEN_MAX.max(script.frames.unwrap_or(0))),
+            );
+            let summary = write::recording(&folder, &script, &options)?;
+            println!("{}: {summary:?}", folder.display());
+            return Ok(());
+        }
+        if !self.depth {
+            bail!("robots send their depth so far: add --depth");
+        }
+        let (stopper, stop) = watch::channel(false);
+        let signals = super::serve::stop_signal()?;
+        tokio::spawn(async move {
+            signals.await;
+            stopper.send_replace(true);
+        });
+        let network = Network {
+            zenoh: self.zenoh,
+            root: self.root,
+            place: self.place,
+        };
+        let summary = fleet::drive(script, self.world.frames, &self.pace, &network, stop).await?;
+        println!("{summary}");
+        if self.json {
+            println!("{}", serde_json::to_string(&summary)?);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,267 @@
+//! What there is to see: shapes with materials, sorted into a tree of bounding boxes.
+
+use super::{
+    shapes::{Bounds, Crossing, Ray, Shape},
+    texture::Pattern,
+};
+
+/// What a shape belongs to; the room itself is 0.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct ObjectId(pub u16);
+
+impl ObjectId {
+    pub const ROOM: Self = Self(0);
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Finish {
+    Matte,
+    /// Varnished, glazed or polished: mirrors `reflectance` at right angles (more at grazing ones).
+    Glossy {
+        reflectance: f32,
+        sharpness: f32,
+    },
+    /// Clear, with this index of refraction; normals point out of the material.
+    Glass {
+        index: f64,
+    },
+}
+
+#[derive(Debug, Clone)]
+pub struct Material {
+    pub pattern: Pattern,
+    pub finish: Finish,
+}
+
+#[derive(Debug, Clone)]
+pub struct Primitive {
+    pub shape: Shape,
+    pub material: Material,
+    pub object: ObjectId,
+    /// The material lies outside of the shape: the shape is the inner wall of a vessel.
+    pub hollow: bool,
+    /// Walls and floors throw no shadow that could be seen.
+    pub casts_shadow: bool,
+}
+
+impl Primitive {
+    pub fn is_glass(&self) -> bool {
+        matches!(self.material.finish, Finish::Glass { .. })
+    }
+
+    /// Big enough to keep a noticeable part of the sky from what is beside it; the table itself and the like count as
+    /// ground instead, which is darker anyway.
+    fn dims_sky(&self) -> bool {
+        let mut half: [f64; 3] = self.shape.bounds().half().into();
+        half.sort_by(f64::total_cmp);
+        let [thin, broad, long] = half;
+        self.casts_shadow
+            && !self.hollow
+            && !self.is_glass()
+            && thin > 0.010
+            && broad > 0.028
+            && long < 0.5
+    }
+
+    fn hides(&self, light: Light) -> bool {
+        match light {
+            Light::Lamp => self.casts_shadow,
+            Light::Sky => self.dims_sky(),
+        }
+    }
+}
+
+/// What light a primitive may hide.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Light {
+    Lamp,
+    Sky,
+}
+
+/// The nearest thing on a ray.
+#[derive(Debug, Clone, Copy)]
+pub struct Hit {
+    pub crossing: Crossing,
+    pub primitive: usize,
+}
+
+#[derive(Debug, Clone)]
+pub struct Scene {
+    primitives: Vec<Primitive>,
+    /// Of each primitive.
+    bounds: Vec<Bounds>,
+    /// Of each primitive: whether it may hide the lamp, and the sky.
+    hides: Vec<[bool; 2]>,
+    nodes: Vec<Node>,
+}
+
+#[derive(Debug, Clone)]
+struct Node {
+    bounds: Bounds,
+    /// Leaf: its primitives. Branch: `count` is 0, the left child follows, `start` is the right one.
+    start: u32,
+    count: u32,
+    hides_lamp: bool,
+    hides_sky: bool,
+}
+
+const LEAF: usize = 2;
+
+impl Scene {
+    pub fn new(mut primitives: Vec<Primitive>) -> Self {
+        let mut nodes = Vec::with_capacity(primitives.len() * 2);
+        if !primitives.is_empty() {
+            build(&mut primitives, 0, &mut nodes);
+        }
+        Self {
+            bounds: primitives
+                .iter()
+                .map(|primitive| primitive.shape.bounds())
+                .collect(),
+            hides: primitives
+                .iter()
+                .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
+                .collect(),
+            primitives,
+            nodes,
+        }
+    }
+
+    pub fn primitives(&self) -> &[Primitive] {
+        &self.primitives
+    }
+
+    /// Of each primitive.
+    pub fn bounds(&self) -> &[Bounds] {
+        &self.bounds
+    }
+
+    /// Of the primitives that `seen` allows.
+    pub fn nearest(
+        &self,
+        ray: &Ray,
+        t_min: f64,
+        t_max: f64,
+        seen: impl Fn(&Primitive) -> bool,
+    ) -> Option<Hit> {
+        // Finite also for a ray along an axis: 0 * infinity would be undefined.
+        let inverse = ray
+            .direction
+            .map(|d| if d.abs() < 1e-12 { 1e12 } else { d.recip() });
+        let mut best: Option<Hit> = None;
+        let mut t_max = t_max;
+        self.walk(
+            |node, t_max: f64| enters(&node.bounds, ray, &inverse, t_max),
+            &mut t_max,
+            |index, t_max| {
+                let primitive = &self.primitives[index];
+                if let Some(crossing) = primitive.shape.crossing(ray, t_min, *t_max)
+                    && seen(primitive)
+                {
+                    *t_max = crossing.t;
+                    best = Some(Hit {
+                        crossing,
+                        primitive: index,
+                    });
+                }
+            },
+        );
+        best
+    }
+
+    /// Collects the primitives that may hide this light and whose bounds `may_hide` does not exclude.
+    pub fn casters(&self, light: Light, found: &mut Vec<u32>, may_hide: impl Fn(&Bounds) -> bool) {
+        found.clear();
+        self.walk(
+            |node, ()| {
+                let any = match light {
+                    Light::Lamp => node.hides_lamp,
+                    Light::Sky => node.hides_sky,
+                };
+                any && may_hide(&node.bounds)
+            },
+            &mut (),
+            |index, _| {
+                if self.hides[index][light as usize] && may_hide(&self.bounds[index]) {
+                    found.push(index as u32);
+                }
+            },
+        );
+    }
+
+    fn walk<S: Copy>(
+        &self,
+        enter: impl Fn(&Node, S) -> bool,
+        state: &mut S,
+        mut visit: impl FnMut(usize, &mut S),
+    ) {
+        let mut stack = [0u32; 64];
+        let mut depth = usize::from(!self.nodes.is_empty());
+        while depth > 0 {
+            depth -= 1;
+            let index = stack[depth];
+            let node = &self.nodes[index as usize];
+            if !enter(node, *state) {
+                continue;
+            }
+            if node.count > 0 {
+                for primitive in node.start..node.start + node.count {
+                    visit(primitive as usize, state);
+                }
+            } else {
+                stack[depth] = node.start;
+                stack[depth + 1] = index + 1;
+                depth += 2;
+            }
+        }
+    }
+}
+
+/// Halves at the median along the longest side: at most 2 * log2(n) open branches.
+fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
+    let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&primitive.shape.bounds())
+    });
+    let index = nodes.len();
+    nodes.push(Node {
+        bounds,
+        start: offset,
+        count: primitives.len() as u32,
+        hides_lamp: primitives
+            .iter()
+            .any(|primitive| primitive.hides(Light::Lamp)),
+        hides_sky: primitives
+            .iter()
+            .any(|primitive| primitive.hides(Light::Sky)),
+    });
+    if primitives.len() <= LEAF {
+        return;
+    }
+    let centers = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&Bounds::of([primitive.shape.bounds().center()]))
+    });
+    let axis = centers.half().imax();
+    let middle = primitives.len() / 2;
+    primitives.select_nth_unstable_by(middle, |a, b| {
+        a.shape.bounds().center()[axis].total_cmp(&b.shape.bounds().center()[axis])
+    });
+    let (left, right) = primitives.split_at_mut(middle);
+    build(left, offset, nodes);
+    nodes[index].start = nodes.len() as u32;
+    nodes[index].count = 0;
+    build(right, offset + middle as u32, nodes);
+}
+
+#[inline]
+fn enters(bounds: &Bounds, ray: &Ray, inverse: &nalgebra::Vector3<f64>, t_max: f64) -> bool {
+    let (mut near, mut far) = (0.0, t_max);
+    for axis in 0..3 {
+        let one = (bounds.min[axis] - ray.origin[axis]) * inverse[axis];
+        let two = (bounds.max[axis] - ray.origin[axis]) * inverse[axis];
+        let (low, high) = if one < two { (one, two) } else { (two, one) };
+        near = if low > near { low } else { near };
+        far = if high < far { high } else { far };
+    }
+    // A touch of slack, so that flat shapes are not lost to rounding.
+    near <= far + 1e-9
+}

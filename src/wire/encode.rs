@@ -1,0 +1,300 @@
+//! Model -> messages -> bytes or JSON.
+
+use std::sync::LazyLock;
+
+use nalgebra::Point3;
+use prost::{Message, Name};
+use prost_reflect::{DescriptorPool, DynamicMessage};
+use prost_types::Timestamp;
+
+use super::{picture, proto};
+use crate::{
+    model::{
+        camera::{Calibration, Intrinsics},
+        frame::{Frame, RgbImage},
+        pose::Pose,
+        refusal::Refusal,
+        report::{Region, Report},
+        viewpoint::Viewpoint,
+    },
+    pipeline::{Maps, PriorAt},
+    stages::interpolate::prior::{self, Prior},
+};
+
+/// A message of the contract.
+pub trait Named: Message + Name {}
+
+impl<M: Message + Name> Named for M {}
+
+pub fn bytes(message: &impl Message) -> Vec<u8> {
+    message.encode_to_vec()
+}
+
+static DESCRIPTORS: LazyLock<DescriptorPool> = LazyLock::new(|| {
+    DescriptorPool::decode(include_bytes!(concat!(env!("OUT_DIR"), "/descriptors.bin")).as_slice())
+        .expect("build.rs wrote the descriptors")
+});
+
+/// As protobuf's JSON mapping says.
+pub fn json<M: Named>(message: &M) -> serde_json::Value {
+    let descriptor = DESCRIPTORS
+        .get_message_by_name(&M::full_name())
+        .expect("every message of the contract is described");
+    let dynamic = DynamicMessage::decode(descriptor, message.encode_to_vec().as_slice())
+        .expect("a message decodes as itself");
+    serde_json::to_value(&dynamic).expect("messages map to JSON")
+}
+
+pub fn timestamp(stamp_ns: i64) -> Timestamp {
+    Timestamp {
+        seconds: stamp_ns.div_euclid(1_000_000_000),
+        // Below 10^9.
+        nanos: stamp_ns.rem_euclid(1_000_000_000) as i32,
+    }
+}
+
+pub fn pose(pose: &Pose) -> proto::Pose {
+    let rotation = &pose.rotation;
+    proto::Pose {
+        position: Some(vector(&pose.translation.vector.into())),
+        orientation: Some(proto::Quaternion {
+            x: rotation.i,
+            y: rotation.j,
+            z: rotation.k,
+            w: rotation.w,
+        }),
+    }
+}
+
+fn vector(point: &Point3<f64>) -> proto::Vector3 {
+    proto::Vector3 {
+        x: point.x,
+        y: point.y,
+        z: point.z,
+    }
+}
+
+pub fn pose_sample(stamp_ns: i64, world_from_camera: &Pose) -> proto::PoseSample {
+    proto::PoseSample {
+        stamp: Some(timestamp(stamp_ns)),
+        world_from_camera: Some(pose(world_from_camera)),
+    }
+}
+
+/// Of a rectified camera.
+pub fn intrinsics(intrinsics: &Intrinsics) -> proto::Intrinsics {
+    proto::Intrinsics {
+        width: intrinsics.width as u32,
+        height: intrinsics.height as u32,
+        fx: intrinsics.fx,
+        fy: intrinsics.fy,
+        cx: intrinsics.cx,
+        cy: intrinsics.cy,
+        distortion_model: String::new(),
+        distortion: Vec::new(),
+    }
+}
+
+pub fn calibration(calibration: &Calibration) -> proto::Calibration {
+    let mut middle = intrinsics(&calibration.intrinsics);
+    if let Some(lens) = &calibration.distortion {
+        middle.distortion_model = "plumb_bob".to_owned();
+        middle.distortion = vec![lens.k1, lens.k2, lens.p1, lens.p2, lens.k3];
+    }
+    proto::Calibration {
+        middle: Some(middle),
+        ..proto::Calibration::default()
+    }
+}
+
+/// As a robot sends it: raw pixels, metres, its own pose; the calibration travels on its own key.
+pub fn frame(frame: &Frame) -> proto::Frame {
+    let Intrinsics { width, height, .. } = frame.intrinsics;
+    let noise = frame.pose_noise;
+    proto::Frame {
+        stamp: Some(timestamp(frame.stamp_ns)),
+        sequence: frame.sequence,
+        image: Some(rgb8(&frame.image)),
+        depth: Some(plane(width, height, frame.depth_m.iter().copied())),
+        world_from_camera: Some(pose(&frame.world_from_camera)),
+        pose_position_sd: noise.map_or(0.0, |noise| noise.position_m),
+        pose_rotation_sd: noise.map_or(0.0, |noise| noise.rotation_rad),
+        ..proto::Frame::default()
+    }
+}
+
+fn image(encoding: &str, width: usize, height: usize, data: Vec<u8>) -> proto::Image {
+    proto::Image {
+        encoding: encoding.to_owned(),
+        width: width as u32,
+        height: height as u32,
+        step: 0,
+        data,
+    }
+}
+
+pub fn rgb8(rgb: &RgbImage) -> proto::Image {
+    image("rgb8", rgb.width, rgb.height, rgb.data.clone())
+}
+
+/// 32FC1.
+pub fn plane(width: usize, height: usize, values: impl Iterator<Item = f32>) -> proto::Image {
+    image(
+        "32FC1",
+        width,
+        height,
+        values.flat_map(f32::to_le_bytes).collect(),
+    )
+}
+
+/// `png`.
+pub fn expected(prior: &Prior) -> proto::Image {
+    let rgb = picture::expected_rgb(prior);
+    image("png", rgb.width, rgb.height, picture::png(&rgb))
+}
+
+pub fn uncertainty(prior: &Prior) -> proto::Image {
+    plane(prior.width, prior.height, picture::uncertainty(prior))
+}
+
+/// mono8.
+pub fn coverage(prior: &Prior) -> proto::Image {
+    let views = prior.plane(prior::COVERAGE).map(|views| views as u8);
+    image("mono8", prior.width, prior.height, views.collect())
+}
+
+pub fn depth(prior: &Prior) -> proto::Image {
+    plane(prior.width, prior.height, prior.plane(prior::DEPTH))
+}
+
+pub fn surprise(maps: &Maps) -> proto::Image {
+    plane(
+        maps.prior.width,
+        maps.prior.height,
+        maps.score.surprise.iter().copied(),
+    )
+}
+
+pub fn blocks(maps: &Maps) -> proto::Image {
+    let blocks = &maps.evidence;
+    plane(blocks.width, blocks.height, blocks.data.iter().copied())
+}
+
+pub fn report(report: &Report, place: &str, processing_seconds: f64) -> proto::SurpriseReport {
+    proto::SurpriseReport {
+        stamp: Some(timestamp(report.stamp_ns)),
+        sequence: report.sequence,
+        place: place.to_owned(),
+        robot: report.source.robot.to_string(),
+        camera: report.source.camera.to_string(),
+        width: report.width as u32,
+        height: report.height as u32,
+        world_from_camera: Some(pose(&report.world_from_camera)),
+        regions: report.regions.iter().map(region).collect(),
+        max_surprise: report.max_surprise,
+        mean_surprise: report.mean_surprise,
+        coverage: report.coverage,
+        learned: report.learned,
+        viewpoint_id: report.viewpoint_id.unwrap_or(0),
+        viewpoints_used: report.viewpoints_used.clone(),
+        processing_seconds,
+        pose_correction_m: report.pose_correction_m,
+        pose_correction_rad: report.pose_correction_rad,
+    }
+}
+
+fn region(region: &Region) -> proto::Region {
+    proto::Region {
+        id: region.id,
+        r#box: Some(proto::Box {
+            x_min: region.pixel_box.x_min,
+            y_min: region.pixel_box.y_min,
+            x_max: region.pixel_box.x_max,
+            y_max: region.pixel_box.y_max,
+        }),
+        peak_x: region.peak_x,
+        peak_y: region.peak_y,
+        peak_surprise: region.peak_surprise,
+        mean_surprise: region.mean_surprise,
+        area: region.area,
+        center_in_world: region.center_in_world.as_ref().map(vector),
+        touches_border: region.touches_border,
+        keypoints: Vec::new(),
+    }
+}
+
+/// `stamp_ns` and `sequence` as far as they could be read.
+pub fn rejection(key: &str, refusal: &Refusal, stamp_ns: i64, sequence: u64) -> proto::Rejection {
+    proto::Rejection {
+        stamp: Some(timestamp(stamp_ns)),
+        key: key.to_owned(),
+        code: refusal.code.to_owned(),
+        detail: refusal.detail.clone(),
+        sequence,
+    }
+}
+
+/// A plane of a `PriorReply`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PriorPlane {
+    Expected,
+    Uncertainty,
+    Coverage,
+    Depth,
+    Parameters,
+}
+
+impl PriorPlane {
+    /// As in `PriorRequest.planes`.
+    pub fn parse(name: &str) -> Option<Self> {
+        Some(match name {
+            "expected" => Self::Expected,
+            "uncertainty" => Self::Uncertainty,
+            "coverage" => Self::Coverage,
+            "depth" => Self::Depth,
+            "parameters" => Self::Parameters,
+            _ => return None,
+        })
+    }
+}
+
+pub fn prior_reply(at: &PriorAt, planes: &[PriorPlane]) -> proto::PriorReply {
+    let prior = &at.prior;
+    let mut reply = proto::PriorReply {
+        viewpoints_used: at.viewpoints_used.clone(),
+        covered: covered(prior),
+        ..proto::PriorReply::default()
+    };
+    for plane in planes {
+        match plane {
+            PriorPlane::Expected => reply.expected = Some(expected(prior)),
+            PriorPlane::Uncertainty => reply.uncertainty = Some(uncertainty(prior)),
+            PriorPlane::Coverage => reply.coverage = Some(coverage(prior)),
+            PriorPlane::Depth => reply.depth = Some(depth(prior)),
+            PriorPlane::Parameters => {
+                reply.parameters = (prior::ALPHA..prior::TAU2)
+                    .flat_map(|plane| prior.plane(plane))
+                    .flat_map(f32::to_le_bytes)
+                    .collect();
+            }
+        }
+    }
+    reply
+}
+
+/// Share of the pixels that some viewpoint saw.
+fn covered(prior: &Prior) -> f32 {
+    let seen = prior.plane(prior::COVERAGE).filter(|&views| views > 0.0);
+    seen.count() as f32 / (prior.width * prior.height).max(1) as f32
+}
+
+pub fn view(viewpoint: &Viewpoint) -> proto::View {
+    proto::View {
+        id: viewpoint.id,
+        world_from_camera: Some(pose(&viewpoint.world_from_camera)),
+        stamp: Some(timestamp(viewpoint.stamp_ns)),
+        robot: viewpoint.source.robot.to_string(),
+        camera: viewpoint.source.camera.to_string(),
+        updates: viewpoint.updates,
+    }
+}
