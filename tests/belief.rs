@@ -10,7 +10,7 @@ use reference::{
 use surprised::{
     config::{Preset, Settings},
     engine::cpu::{CpuEngine, Observation, Score},
-    model::belief::{Belief, CHANNELS, SPREAD_MAX, SPREAD_MIN},
+    model::belief::Belief,
     stages::{
         interpolate::prior::{self, Prior},
         surprise::{GammaTerm, surprise},
