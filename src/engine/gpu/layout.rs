@@ -6,7 +6,7 @@ use crate::{
     config::{Settings, UnseenStart},
     model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
     stages::{
-        attend::BLOCK, interpolate::project::Projector, surprise::GammaTerm, update::UpdateRules,
+        attend::BLOCK, interpolate::project::homography, surprise::GammaTerm, update::UpdateRules,
     },
 };
 
@@ -69,13 +69,12 @@ impl View {
         weight: f32,
         fresh: bool,
     ) -> Self {
-        let projector = Projector::new(
-            &viewpoint.mesh,
+        let (h_matrix, h_offset) = homography(
+            &viewpoint.mesh.intrinsics,
             &viewpoint.world_from_camera,
             intrinsics,
             world_from_camera,
         );
-        let (h_matrix, h_offset) = projector.homography();
         let row = |axis: usize| {
             [
                 h_matrix[(axis, 0)] as f32,

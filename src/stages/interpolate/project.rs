@@ -71,6 +71,25 @@ pub struct Projector<'a> {
     h_offset: Vector3<f64>,
 }
 
+/// H and h of [`Projector`].
+pub fn homography(
+    source: &Intrinsics,
+    world_from_view: &Pose,
+    target: &Intrinsics,
+    world_from_target: &Pose,
+) -> (Matrix3<f64>, Vector3<f64>) {
+    let target_from_view = world_from_target.inverse() * world_from_view;
+    let k = target.matrix();
+    let k_inverse = source
+        .matrix()
+        .try_inverse()
+        .expect("focal lengths are checked to be positive");
+    (
+        k * target_from_view.rotation.to_rotation_matrix().matrix() * k_inverse,
+        k * target_from_view.translation.vector,
+    )
+}
+
 /// One row of projected vertices.
 #[derive(Default, Clone)]
 struct VertexRow {
@@ -94,23 +113,13 @@ impl<'a> Projector<'a> {
         target: &Intrinsics,
         world_from_target: &Pose,
     ) -> Self {
-        let target_from_view = world_from_target.inverse() * world_from_view;
-        let k = target.matrix();
-        let k_inverse = mesh
-            .intrinsics
-            .matrix()
-            .try_inverse()
-            .expect("focal lengths are checked to be positive");
+        let (h_matrix, h_offset) =
+            homography(&mesh.intrinsics, world_from_view, target, world_from_target);
         Self {
             mesh,
-            h_matrix: k * target_from_view.rotation.to_rotation_matrix().matrix() * k_inverse,
-            h_offset: k * target_from_view.translation.vector,
+            h_matrix,
+            h_offset,
         }
-    }
-
-    /// H and h.
-    pub fn homography(&self) -> (&Matrix3<f64>, &Vector3<f64>) {
-        (&self.h_matrix, &self.h_offset)
     }
 
     /// Draws what falls into rows `strip` of the target. `map` is that strip, `strip.len() * width` samples, and keeps
