@@ -448,6 +448,16 @@ fn a_pipeline_on_the_card_reports_what_one_on_the_processor_reports() {
     // What is learnt is there already.
     assert_eq!(counters.views_brought, 0, "{counters:?}");
     assert_eq!(counters.passes, 8 * 14 + 6, "{counters:?}");
+    // As the head comment of the engine says: 7 bytes a pixel up; evidence and posterior down, and now and then a map.
+    let (pixels, frames) = (165 * 123, 15);
+    let parameters = counters.uploaded_bytes - 7 * pixels * frames;
+    assert!(parameters < 2048 * frames, "{counters:?}");
+    let maps = counters.read_back_bytes - frames * (144 + 4 * 41 * 30 + 32 * pixels);
+    assert_eq!(maps % (4 * pixels), 0, "{counters:?}");
+    assert!(
+        maps >= 2 * 4 * pixels && maps < frames * 4 * pixels,
+        "{counters:?}"
+    );
     writeln!(std::io::stderr(), "{counters:?}").unwrap();
 }
 
@@ -485,6 +495,23 @@ fn a_lost_device_loses_no_frame_that_was_reported() {
     );
     assert_eq!(on_gpu(disturbed.pipeline.engine()).counters().losses, 3);
     assert_eq!(on_gpu(undisturbed.pipeline.engine()).counters().losses, 0);
+}
+
+#[test]
+fn an_image_that_is_too_large_for_a_small_device_is_recalled_all_the_same() {
+    let settings = Settings::robust();
+    let Some(mut engine) = gpu(&settings) else {
+        return;
+    };
+    // Its posterior exceeds the 128 MiB of a binding that every device grants.
+    let large = camera(2100, 2100);
+    let mut prior = Prior::default();
+    engine.recall(&[], &large, &pose([0.0; 3], [0.0; 3]), &mut prior);
+    assert_eq!((prior.width, prior.height), (2100, 2100));
+    assert!(prior.plane(prior::COVERAGE).all(|count| count == 0.0));
+    let counters = on_gpu(&engine).counters();
+    assert_eq!(counters.on_processor + u64::from(counters.passes > 0), 1);
+    assert_eq!(counters.losses, 0);
 }
 
 #[test]

@@ -66,6 +66,7 @@ pub struct Counters {
     pub on_processor: u64,
     pub passes: u64,
     pub uploaded_bytes: u64,
+    /// For reports and priors; not the maps that somebody wanted.
     pub read_back_bytes: u64,
     /// Viewpoints that had to be uploaded, and that had to make room.
     pub views_brought: u64,
