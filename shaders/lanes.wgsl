@@ -1,4 +1,4 @@
-// Twin of src/stages/lanes.rs: `ln` and `exp` from the same polynomials, because the built-in ones may be off by more
+// Twin of src/lanes.rs: `ln` and `exp` from the same polynomials, because the built-in ones may be off by more
 // than a belief can bear. Rounding is the built-in one: the trick with a large number does not survive compilers that
 // reorder.
 

@@ -40,7 +40,6 @@ struct Rules {
     edge_variance_px: f32,
     surprise_threshold: f32,
     depth_vote_tolerance: f32,
-    mesh_cut: f32,
     gamma_center: f32,
     gamma_scale: f32,
     second_look: u32,

@@ -37,8 +37,13 @@ struct Surface {
     v: f32,
 }
 
-fn source_depth_m(view: View, column: u32, row: u32) -> f32 {
+fn source(view: View, column: u32, row: u32) -> u32 {
     return depth_arena[view.first + row * view.width + column];
+}
+
+/// The two lowest bits say which triangles exist, as Mesh::cut; the others are the depth, metres.
+fn source_depth_m(bits: u32) -> f32 {
+    return bitcast<f32>(bits & ~(UPPER_LEFT | LOWER_RIGHT));
 }
 
 fn transform(view: View, column: u32, row: u32, z: f32) -> Vertex {
@@ -59,27 +64,15 @@ fn transform(view: View, column: u32, row: u32, z: f32) -> Vertex {
     );
 }
 
-/// As Mesh::new: a triangle exists where its three vertices have depth and none is much farther than another.
-fn joined(a: f32, b: f32, c: f32) -> bool {
-    let z_min = min(min(a, b), c);
-    let z_max = max(max(a, b), c);
-    return z_min > 0.0 && z_max - z_min <= rules.mesh_cut * z_min;
-}
-
 fn load_quad(view: View, column: u32, row: u32) -> Quad {
-    let z = vec4<f32>(
-        source_depth_m(view, column, row),
-        source_depth_m(view, column + 1u, row),
-        source_depth_m(view, column, row + 1u),
-        source_depth_m(view, column + 1u, row + 1u),
-    );
+    let upper_left = source(view, column, row);
     var quad: Quad;
-    quad.triangles = select(0u, UPPER_LEFT, joined(z.x, z.y, z.z)) | select(0u, LOWER_RIGHT, joined(z.w, z.z, z.y));
+    quad.triangles = upper_left & (UPPER_LEFT | LOWER_RIGHT);
     if quad.triangles != 0u {
-        quad.corners[0] = transform(view, column, row, z.x);
-        quad.corners[1] = transform(view, column + 1u, row, z.y);
-        quad.corners[2] = transform(view, column, row + 1u, z.z);
-        quad.corners[3] = transform(view, column + 1u, row + 1u, z.w);
+        quad.corners[0] = transform(view, column, row, source_depth_m(upper_left));
+        quad.corners[1] = transform(view, column + 1u, row, source_depth_m(source(view, column + 1u, row)));
+        quad.corners[2] = transform(view, column, row + 1u, source_depth_m(source(view, column, row + 1u)));
+        quad.corners[3] = transform(view, column + 1u, row + 1u, source_depth_m(source(view, column + 1u, row + 1u)));
         // A triangle with a vertex that cannot be drawn is none: its box would reach to wherever that vertex lies.
         let inner = min(quad.corners[1].inverse_depth, quad.corners[2].inverse_depth);
         quad.triangles &= select(0u, UPPER_LEFT, min(quad.corners[0].inverse_depth, inner) > 0.0)

@@ -120,7 +120,14 @@ pub struct Settings {
     /// Depth outside is taken as none, metres.
     pub depth_min_m: f32,
     pub depth_max_m: f32,
-    /// How long a frame without a pose waits for one from the `pose` key, seconds.
+    /// Where depth is computed from three cameras: how many depths are tried at every pixel, at equal distances of
+    /// 1/depth. Half a pixel of shift between two cameras from one to the next is as fine as the images tell; time
+    /// grows with it. A label is a byte: at most 255.
+    pub depth_labels: usize,
+    /// Nearest and farthest of them, metres. What is nearer is taken for something else; a far end of 1e6 is infinity.
+    pub depth_near_m: f64,
+    pub depth_far_m: f64,
+    /// How long a frame without a pose waits for one from the `pose` or `markers` key, seconds.
     pub pose_wait_s: f64,
     /// Pull mode: how often the service gets each robot's `frame` key, per second. 0 = robots push.
     pub pull_hz: f64,
@@ -196,6 +203,9 @@ impl Settings {
             image_pixels_max: 8_000_000,
             depth_min_m: 0.05,
             depth_max_m: 100.0,
+            depth_labels: 64,
+            depth_near_m: 0.4,
+            depth_far_m: 20.0,
             pose_wait_s: 0.2,
             pull_hz: 0.0,
             threads: 0,
@@ -286,6 +296,14 @@ impl Settings {
         within("image_pixels_max", self.image_pixels_max, 64, 64_000_000)?;
         within("depth_min_m", self.depth_min_m, 1e-3, 1e3)?;
         within("depth_max_m", self.depth_max_m, self.depth_min_m, 1e4)?;
+        within("depth_labels", self.depth_labels, 2, 255)?;
+        within("depth_near_m", self.depth_near_m, 1e-2, 1e3)?;
+        within(
+            "depth_far_m",
+            self.depth_far_m,
+            1.1 * self.depth_near_m,
+            1e6,
+        )?;
         within("pose_wait_s", self.pose_wait_s, 0.0, 10.0)?;
         within("pull_hz", self.pull_hz, 0.0, 1000.0)?;
         within("threads", self.threads, 0, 1024)

@@ -52,3 +52,9 @@ pub mod config;
 
 /// What flows: frame, camera, pose, belief, viewpoint, report.
 pub mod model;
+
+/// Values side by side, and arithmetic on them that becomes vector code.
+pub mod lanes;
+
+/// Which instructions the hot loops are compiled for.
+pub mod isa;

@@ -3,35 +3,42 @@
 
 use std::{cell::OnceCell, collections::HashMap, sync::Arc};
 
+use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
     engine::{
-        Engine, Question,
+        Answer, Engine, Question,
         cpu::{CpuEngine, Observation, RecallView, Score},
-        isa::Isa,
     },
+    isa::Isa,
     memory::{Memory, visit::Visit},
     model::{
+        belief::Record,
         camera::Intrinsics,
-        frame::{Frame, FrameError, Source},
+        frame::{DepthSource, Frame, FrameError, Sides, Source},
         pose::{Pose, PoseNoise},
         report::Report,
-        viewpoint::{Coarse, Mesh, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
-        interpolate::prior::Prior,
+        depth::{InverseDepthRange, SidesDepth, given},
+        interpolate::{
+            merge::VIEWS_MAX,
+            prior::{self, Prior},
+        },
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
-        select::select_nearest,
+        select::select_into,
     },
 };
 
-/// Less depth than this share of the image is none: such a viewpoint could never be recalled.
-const DEPTH_SHARE_MIN: f64 = 0.01;
-/// When less of the depth than this lies in the settings' range, its unit must be wrong.
-const DEPTH_IN_RANGE_MIN: f64 = 0.1;
+/// Pixels times labels that depth is computed of: 250 MB of costs, and somewhat more for what is sent between pixels.
+const DEPTH_COSTS_MAX: usize = 1 << 28;
+/// Labels between neighbours that still are one surface: a slanted one moves by one at a time, and refinement below a
+/// label adds to that on both sides.
+const LABELS_JOINED: f32 = 1.5;
 
 /// Everything that was computed for the last frame, until the next.
 #[derive(Debug, Clone, Default)]
@@ -58,17 +65,26 @@ struct Camera {
     follower: Follower,
 }
 
-/// A frame compared with what was expected; nothing is learnt yet.
-struct Look {
-    world_from_camera: Pose,
-    selected: Vec<usize>,
+/// Working memory between frames: what was overwritten is filled again.
+#[derive(Default)]
+struct Workspace {
+    /// Metres; 0 = none, or out of the settings' range.
     depth_m: Vec<f32>,
-    camera: Camera,
-    report: Report,
+    cut: MeshCut,
+    /// What is expected where depth is computed.
+    expected: Prior,
+    observation: Observation,
+    selected: Vec<usize>,
+    blocks: BlockMap,
+    mesh: Mesh,
+    records: Vec<Record>,
+    coarse: Coarse,
 }
 
 pub struct Pipeline {
     settings: Settings,
+    pool: Arc<ThreadPool>,
+    sides_depth: SidesDepth,
     engine: Engine,
     refiner: PoseRefiner,
     memory: Memory,
@@ -76,9 +92,10 @@ pub struct Pipeline {
     last_region_id: u64,
     /// What the last frame's report needed.
     maps: Maps,
+    maps_read: bool,
     /// All of them, if the engine kept some and somebody wanted them.
     whole_maps: OnceCell<Maps>,
-    maps_read: bool,
+    workspace: Workspace,
 }
 
 impl Pipeline {
@@ -89,21 +106,29 @@ impl Pipeline {
 
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
-        let engine = Engine::Cpu(CpuEngine::new(&settings, pool, isa));
-        Self::with_engine(settings, engine)
+        let engine = Engine::Cpu(CpuEngine::new(&settings, pool.clone(), isa));
+        Self::with_engine(settings, pool, isa, engine)
     }
 
     /// With an engine that was made for these settings.
-    pub fn with_engine(settings: Settings, engine: Engine) -> Self {
+    pub fn with_engine(
+        settings: Settings,
+        pool: Arc<ThreadPool>,
+        isa: Isa,
+        engine: Engine,
+    ) -> Self {
         Self {
+            sides_depth: SidesDepth::new(depth_range(&settings)),
             engine,
-            refiner: PoseRefiner::default(),
+            pool,
+            refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
             cameras: HashMap::new(),
             last_region_id: 0,
             maps: Maps::default(),
-            whole_maps: OnceCell::new(),
             maps_read: true,
+            whole_maps: OnceCell::new(),
+            workspace: Workspace::default(),
             settings,
         }
     }
@@ -147,20 +172,47 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        let Look {
-            world_from_camera,
-            selected,
-            depth_m,
-            mut camera,
-            mut report,
-        } = self.look(frame, true)?;
-        let records = self.maps.score.posterior.clone();
-        let mesh = Mesh::new(frame.intrinsics, depth_m, self.settings.mesh_cut);
+        self.depth(frame)?;
+        let mut camera = match self.cameras.get_mut(&frame.source) {
+            Some(camera) => std::mem::take(camera),
+            None => Camera::default(),
+        };
+        let looked = self.look(frame, &mut camera.visit, true).map(|mut report| {
+            let id = self.remember(frame, &report.world_from_camera);
+            camera.visit.wrote(id);
+            camera
+                .follower
+                .follow(&mut report.regions, &mut self.last_region_id);
+            report.learned = true;
+            report.viewpoint_id = Some(id);
+            report
+        });
+        match self.cameras.get_mut(&frame.source) {
+            Some(slot) => *slot = camera,
+            None => {
+                self.cameras.insert(frame.source.clone(), camera);
+            }
+        }
+        looked
+    }
+
+    /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
+    fn remember(&mut self, frame: &Frame, world_from_camera: &Pose) -> u64 {
+        let work = &mut self.workspace;
+        let mut mesh = std::mem::take(&mut work.mesh);
+        let mut coarse = std::mem::take(&mut work.coarse);
+        let mut records = std::mem::take(&mut work.records);
+        mesh.intrinsics = frame.intrinsics;
+        std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
+        records.clear();
+        records.extend_from_slice(&self.maps.score.posterior);
+        self.engine
+            .prepare(&mut mesh, &records, &mut coarse, work.cut);
         let viewpoint = Viewpoint {
-            coarse: Coarse::new(&mesh, &records, self.settings.mesh_cut),
+            coarse,
             id: 0,
-            world_from_camera,
-            world_from_home: world_from_camera,
+            world_from_camera: *world_from_camera,
+            world_from_home: *world_from_camera,
             mesh,
             records,
             source: frame.source.clone(),
@@ -168,23 +220,21 @@ impl Pipeline {
             updates: 0,
         };
         let slot = self.memory.slot(
-            &selected,
-            &world_from_camera,
+            &work.selected,
+            world_from_camera,
             viewpoint.bytes(),
             &self.settings,
         );
-        let id = self.memory.write(slot, viewpoint);
+        let (id, old) = self.memory.replace(slot, viewpoint);
         let written = self.memory.viewpoints().iter().find(|view| view.id == id);
         self.engine
             .remember(written.expect("it was written just now"));
-        camera.visit.wrote(id);
-        camera
-            .follower
-            .follow(&mut report.regions, &mut self.last_region_id);
-        self.cameras.insert(frame.source.clone(), camera);
-        report.learned = true;
-        report.viewpoint_id = Some(id);
-        Ok(report)
+        if let Some(old) = old {
+            work.mesh = old.mesh;
+            work.coarse = old.coarse;
+            work.records = old.records;
+        }
+        id
     }
 
     /// Compares a frame with the memory and changes nothing but [`Self::maps`]. Its regions have no ids.
@@ -192,12 +242,18 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.look(frame, false).map(|look| look.report)
+        self.depth(frame)?;
+        let camera = self.cameras.get(&frame.source);
+        let mut visit = camera
+            .map(|camera| camera.visit.clone())
+            .unwrap_or_default();
+        self.look(frame, &mut visit, false)
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
     pub fn prior(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> PriorAt {
-        let selected = self.select(world_from_camera);
+        let mut selected = Vec::new();
+        self.select(world_from_camera, &mut selected);
         let mut prior = Prior::default();
         let views = recall_views(&self.memory, &self.settings, &selected, &Visit::default());
         self.engine
@@ -213,39 +269,55 @@ impl Pipeline {
         self.cameras.remove(source);
     }
 
-    fn look(&mut self, frame: &Frame, learn: bool) -> Result<Look, FrameError> {
-        let depth_m = self.checked_depth(frame)?;
-        let mut camera = self.cameras.get(&frame.source).cloned().unwrap_or_default();
-        let observation = Observation::new(&frame.image);
+    /// Compares a checked frame with what is expected; nothing is learnt yet.
+    fn look(
+        &mut self,
+        frame: &Frame,
+        visit: &mut Visit,
+        learn: bool,
+    ) -> Result<Report, FrameError> {
+        let mut work = std::mem::take(&mut self.workspace);
+        let mut maps = std::mem::take(&mut self.maps);
+        self.engine.observe(&frame.image, &mut work.observation);
 
-        let refined = self.refine(frame, &observation, &camera.visit);
+        let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
         let world_from_camera = refined.world_from_camera;
 
-        let selected = self.select(&world_from_camera);
-        let used = self.ids(&selected);
-        camera.visit.select(&used);
+        self.select(&world_from_camera, &mut work.selected);
+        let used = self.ids(&work.selected);
+        visit.select(&used);
 
-        let mut maps = std::mem::take(&mut self.maps);
-        let views = recall_views(&self.memory, &self.settings, &selected, &camera.visit);
+        let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
         let question = Question {
             views: &views,
             intrinsics: &frame.intrinsics,
             world_from_camera: &world_from_camera,
             image: &frame.image,
-            observation: &observation,
+            observation: &work.observation,
         };
-        let evidence = self.settings.evidence;
+        let answer = Answer {
+            prior: &mut maps.prior,
+            score: &mut maps.score,
+            evidence: &mut maps.evidence,
+            blocks: &mut work.blocks,
+        };
         let compared = self
             .engine
-            .compare(&question, evidence, learn, &mut maps.prior, &mut maps.score)
-            .map_err(|error| FrameError::Engine(error.to_string()))?;
-        maps.intrinsics = Some(frame.intrinsics);
-        maps.evidence = compared.evidence;
-        self.maps_read = compared.maps_read;
+            .compare(&question, self.settings.evidence, learn, answer);
         self.whole_maps.take();
+        let compared = match compared {
+            Ok(compared) => compared,
+            Err(error) => {
+                self.workspace = work;
+                self.maps_read = true;
+                return Err(FrameError::Engine(error.to_string()));
+            }
+        };
+        maps.intrinsics = Some(frame.intrinsics);
+        self.maps_read = compared.maps_read;
 
         let scene = Scene {
-            depth_m: &depth_m,
+            depth_m: &work.depth_m,
             intrinsics: &frame.intrinsics,
             world_from_camera: &world_from_camera,
         };
@@ -275,16 +347,17 @@ impl Pipeline {
             pose_correction_rad: refined.correction_rad,
         };
         self.maps = maps;
-        Ok(Look {
-            world_from_camera,
-            selected,
-            depth_m,
-            camera,
-            report,
-        })
+        self.workspace = work;
+        Ok(report)
     }
 
-    fn refine(&mut self, frame: &Frame, observation: &Observation, visit: &Visit) -> Refined {
+    fn refine(
+        &mut self,
+        frame: &Frame,
+        observation: &Observation,
+        visit: &Visit,
+        selected: &mut Vec<usize>,
+    ) -> Refined {
         if !self.settings.refine_pose {
             return Refined::unchanged(frame.world_from_camera);
         }
@@ -292,10 +365,10 @@ impl Pipeline {
             position_m: self.settings.pose_position_sd_m,
             rotation_rad: self.settings.pose_rotation_sd_rad,
         });
-        let mut selected = self.select(&frame.world_from_camera);
+        self.select(&frame.world_from_camera, selected);
         selected.truncate(REFINE_VIEWS);
-        let recalled = recall_views(&self.memory, &self.settings, &selected, visit);
-        let views: Vec<(&Coarse, &Pose, f32)> = recalled
+        let recalled = recall_views(&self.memory, &self.settings, selected, visit);
+        let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = recalled
             .iter()
             .map(|view| {
                 (
@@ -314,19 +387,20 @@ impl Pipeline {
         )
     }
 
-    fn select(&self, world_from_camera: &Pose) -> Vec<usize> {
+    fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {
         let poses = self
             .memory
             .viewpoints()
             .iter()
             .map(|viewpoint| &viewpoint.world_from_camera);
-        select_nearest(
+        select_into(
             poses,
             world_from_camera,
             self.settings.metres_per_radian,
             self.settings.views,
             self.settings.view_distance_max_m,
-        )
+            selected,
+        );
     }
 
     fn ids(&self, selected: &[usize]) -> Vec<u64> {
@@ -336,8 +410,8 @@ impl Pipeline {
             .collect()
     }
 
-    /// The frame's depth with everything outside the settings' range taken as none.
-    fn checked_depth(&self, frame: &Frame) -> Result<Vec<f32>, FrameError> {
+    /// The frame's depth, given or computed, goes into the workspace.
+    fn depth(&mut self, frame: &Frame) -> Result<(), FrameError> {
         let Intrinsics { width, height, .. } = frame.intrinsics;
         if (frame.image.width, frame.image.height) != (width, height) {
             return Err(FrameError::ImageSize {
@@ -347,43 +421,96 @@ impl Pipeline {
                 height,
             });
         }
-        if frame.depth_m.len() != width * height {
-            return Err(FrameError::DepthSize {
-                got: frame.depth_m.len(),
-                expected: width * height,
-            });
+        match &frame.depth {
+            DepthSource::Given(depth_m) => {
+                self.workspace.cut = self.settings.mesh_cut.into();
+                given::check(
+                    depth_m,
+                    width * height,
+                    &self.settings,
+                    &mut self.workspace.depth_m,
+                )
+            }
+            DepthSource::Sides(sides) => self.depth_from_sides(frame, sides),
         }
-        let range = self.settings.depth_min_m..=self.settings.depth_max_m;
-        let mut given: Vec<f32> = frame
-            .depth_m
-            .iter()
-            .copied()
-            .filter(|z| z.is_finite() && *z > 0.0)
-            .collect();
-        let share = given.len() as f64 / frame.depth_m.len() as f64;
-        if share < DEPTH_SHARE_MIN {
-            return Err(FrameError::NoDepth {
-                valid_percent: 100.0 * share,
-            });
-        }
-        let valid = given.iter().filter(|z| range.contains(z)).count() as f64 / given.len() as f64;
-        if valid < DEPTH_IN_RANGE_MIN {
-            let middle = given.len() / 2;
-            let (_, &mut median_m, _) = given.select_nth_unstable_by(middle, f32::total_cmp);
-            return Err(FrameError::DepthUnit {
-                valid_percent: 100.0 * valid,
-                min_m: *range.start(),
-                max_m: *range.end(),
-                median_m,
-            });
-        }
-        // NaN is in no range.
-        Ok(frame
-            .depth_m
-            .iter()
-            .map(|&z| if range.contains(&z) { z } else { 0.0 })
-            .collect())
     }
+
+    fn depth_from_sides(&mut self, frame: &Frame, sides: &Sides) -> Result<(), FrameError> {
+        for (side, view) in [("left", &sides.left), ("right", &sides.right)] {
+            let (got, camera) = (&view.image, &view.intrinsics);
+            if (got.width, got.height) != (camera.width, camera.height) {
+                return Err(FrameError::SideSize {
+                    side,
+                    got_width: got.width,
+                    got_height: got.height,
+                    width: camera.width,
+                    height: camera.height,
+                });
+            }
+        }
+        let pixels = frame.intrinsics.pixels();
+        let labels = self.settings.depth_labels;
+        if pixels.saturating_mul(labels) > DEPTH_COSTS_MAX {
+            return Err(FrameError::DepthTooLarge {
+                pixels,
+                labels,
+                most: DEPTH_COSTS_MAX,
+            });
+        }
+        let expected_m = self.expected_depth(frame);
+        let image = frame.image.grey();
+        let computed = self.pool.install(|| {
+            self.sides_depth
+                .compute(&frame.intrinsics, &image, sides, expected_m.as_deref())
+        });
+        let (inverse_depth, computed_m) = (computed.label_step * LABELS_JOINED, &computed.depth_m);
+        self.workspace.cut = MeshCut {
+            share: self.settings.mesh_cut,
+            inverse_depth,
+        };
+        given::check(
+            computed_m,
+            pixels,
+            &self.settings,
+            &mut self.workspace.depth_m,
+        )
+    }
+
+    /// What the memory expects from the frame's pose as it was given: good enough where the images say nothing.
+    fn expected_depth(&mut self, frame: &Frame) -> Option<Vec<f32>> {
+        let work = &mut self.workspace;
+        let mut selected = std::mem::take(&mut work.selected);
+        let mut expected = std::mem::take(&mut work.expected);
+        self.select(&frame.world_from_camera, &mut selected);
+        let depth_m = (!selected.is_empty()).then(|| {
+            let visit = Visit::default();
+            let visit = self
+                .cameras
+                .get(&frame.source)
+                .map_or(&visit, |camera| &camera.visit);
+            let views = recall_views(&self.memory, &self.settings, &selected, visit);
+            self.engine.recall(
+                &views,
+                &frame.intrinsics,
+                &frame.world_from_camera,
+                &mut expected,
+            );
+            expected.plane(prior::DEPTH).collect()
+        });
+        self.workspace.selected = selected;
+        self.workspace.expected = expected;
+        depth_m
+    }
+}
+
+/// The hypotheses where depth is computed.
+pub fn depth_range(settings: &Settings) -> InverseDepthRange {
+    InverseDepthRange::new(
+        1.0 / settings.depth_far_m,
+        1.0 / settings.depth_near_m,
+        settings.depth_labels,
+    )
+    .expect("settings were validated")
 }
 
 /// The selected viewpoints with the weights that this visit gives them.
@@ -392,7 +519,7 @@ fn recall_views<'a>(
     settings: &Settings,
     selected: &[usize],
     visit: &Visit,
-) -> Vec<RecallView<'a>> {
+) -> ArrayVec<RecallView<'a>, VIEWS_MAX> {
     selected
         .iter()
         .map(|&index| {

@@ -3,7 +3,7 @@
 
 use proptest::{prelude::*, test_runner::Config};
 use surprised::{
-    engine::isa::Isa,
+    isa::Isa,
     stages::depth::{BeliefPropagation, Contrast, PropagationSettings, Smoothness},
 };
 

@@ -6,7 +6,7 @@ mod rendered;
 use nalgebra::{Translation3, UnitQuaternion, Vector3};
 use rendered::{Room, Sensor, Shape, Texture, View};
 use surprised::{
-    engine::isa::Isa,
+    isa::Isa,
     model::{camera::Intrinsics, pose::Pose},
     stages::depth::{
         DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SEEN_BY_LEFT,

@@ -15,7 +15,7 @@ use reference::{
 use surprised::{
     config::{Preset, Settings},
     engine::{
-        Engine, EngineError, EngineKind, Question,
+        Answer, Engine, EngineError, EngineKind, Question,
         cpu::{CpuEngine, Observation, RecallView, Score},
         gpu::GpuEngine,
     },
@@ -251,8 +251,15 @@ fn posterior_surprise_gain_and_evidence_are_those_of_the_reference() {
                 observation: &observation,
             };
             let (mut prior, mut score) = (Prior::default(), Score::default());
+            let mut found = BlockMap::default();
+            let answer = Answer {
+                prior: &mut prior,
+                score: &mut score,
+                evidence: &mut found,
+                blocks: &mut BlockMap::default(),
+            };
             let compared = engine
-                .compare(&question, settings.evidence, true, &mut prior, &mut score)
+                .compare(&question, settings.evidence, true, answer)
                 .expect("the device is there");
             let learnt = score.posterior.clone();
             assert!(!compared.maps_read);
@@ -286,9 +293,9 @@ fn posterior_surprise_gain_and_evidence_are_those_of_the_reference() {
             let evidence = BlockMap::evidence(&score.surprise, width, settings.evidence);
             assert_eq!(
                 (evidence.width, evidence.height),
-                (compared.evidence.width, compared.evidence.height)
+                (found.width, found.height)
             );
-            for (got, expected) in compared.evidence.data.iter().zip(&evidence.data) {
+            for (got, expected) in found.data.iter().zip(&evidence.data) {
                 assert!((got - expected).abs() <= 1e-5 * expected.max(1.0));
             }
             for y in 0..height {
@@ -386,7 +393,7 @@ struct Robot {
 impl Robot {
     fn new(engine: Engine) -> Self {
         Self {
-            pipeline: Pipeline::with_engine(Settings::robust(), engine),
+            pipeline: Pipeline::with_engine(Settings::robust(), pool(1), isas()[0], engine),
             sequence: 0,
         }
     }

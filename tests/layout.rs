@@ -6,8 +6,21 @@ use std::{
 };
 
 /// From the outside in.
-const ROOMS: [&str; 9] = [
-    "commands", "service", "wire", "pipeline", "engine", "memory", "stages", "config", "model",
+const ROOMS: [&str; 14] = [
+    "commands",
+    "service",
+    "wire",
+    "evaluation",
+    "dataset",
+    "simulation",
+    "pipeline",
+    "engine",
+    "memory",
+    "stages",
+    "config",
+    "model",
+    "lanes",
+    "isa",
 ];
 
 /// A crate, and the only paths below `src` that may name it.

@@ -30,7 +30,7 @@ fn learn(memory: &mut Memory, x_m: f64, settings: &Settings) -> (Slot, u64) {
         .viewpoints()
         .iter()
         .map(|viewpoint| &viewpoint.world_from_camera);
-    let selected = select_nearest(poses, &at(x_m), 1.0, 7);
+    let selected = select_nearest(poses, &at(x_m), 1.0, 7, f64::INFINITY);
     let viewpoint = viewpoint_at(x_m);
     let slot = memory.slot(&selected, &at(x_m), viewpoint.bytes(), settings);
     let id = memory.write(slot, viewpoint);

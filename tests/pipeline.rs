@@ -11,7 +11,7 @@ use reference::{
 use surprised::{
     config::{Preset, Settings},
     model::{
-        frame::Frame,
+        frame::{DepthSource, Frame},
         pose::Pose,
         report::{PixelBox, Report},
     },
@@ -284,6 +284,13 @@ fn what_evaluate_says_is_what_processing_would_have_said() {
 
 type Spoil = Box<dyn Fn(&mut Frame)>;
 
+fn given(frame: &mut Frame) -> &mut Vec<f32> {
+    match &mut frame.depth {
+        DepthSource::Given(depth_m) => depth_m,
+        DepthSource::Sides(_) => panic!("these frames have depth"),
+    }
+}
+
 #[test]
 fn rejected_frames_change_nothing_and_say_why() {
     let mut plain = Robot::new(Settings::robust());
@@ -293,13 +300,13 @@ fn rejected_frames_change_nothing_and_say_why() {
         let good = frame(&place(false), &here, 700);
         let bad: [(&str, Spoil); 6] = [
             ("image_size", Box::new(|frame| frame.image.width -= 1)),
-            ("depth_size", Box::new(|frame| frame.depth_m.truncate(100))),
-            ("no_depth", Box::new(|frame| frame.depth_m.fill(0.0))),
-            ("no_depth", Box::new(|frame| frame.depth_m.fill(f32::NAN))),
-            ("no_depth", Box::new(|frame| frame.depth_m.fill(-1.0))),
+            ("depth_size", Box::new(|frame| given(frame).truncate(100))),
+            ("no_depth", Box::new(|frame| given(frame).fill(0.0))),
+            ("no_depth", Box::new(|frame| given(frame).fill(f32::NAN))),
+            ("no_depth", Box::new(|frame| given(frame).fill(-1.0))),
             (
                 "depth_unit",
-                Box::new(|frame| frame.depth_m.iter_mut().for_each(|z| *z *= 1000.0)),
+                Box::new(|frame| given(frame).iter_mut().for_each(|z| *z *= 1000.0)),
             ),
         ];
         for (code, spoil) in bad {

@@ -89,14 +89,26 @@ fn images_get_the_depth_and_the_pose_of_their_time() {
     assert_eq!(recording.skipped, 1);
     let first = recording.frame(0, &source()).unwrap();
     assert_eq!(first.stamp_ns, 1_000_000_000);
-    assert_eq!(first.depth_m, vec![1.0; 24], "5000 steps a metre");
+    assert_eq!(
+        first.depth.given_m(),
+        Some([1.0; 24].as_slice()),
+        "5000 steps a metre"
+    );
     assert_eq!(&first.image.data[..3], [10, 20, 30]);
     assert_eq!((first.intrinsics.width, first.intrinsics.height), (6, 4));
     assert_eq!((first.intrinsics.fy, first.intrinsics.cx), (101.0, 2.5));
     let x = |index: usize| recording.entries[index].world_from_camera.translation.x;
     assert!((x(0) - 1.5).abs() < 1e-9, "halfway between two close poses");
     assert_eq!(x(1), 5.0, "the nearest where poses are far apart");
-    assert_eq!(recording.frame(1, &source()).unwrap().depth_m[0], 2.0);
+    assert_eq!(
+        recording
+            .frame(1, &source())
+            .unwrap()
+            .depth
+            .given_m()
+            .unwrap()[0],
+        2.0
+    );
 }
 
 #[test]

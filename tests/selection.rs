@@ -35,7 +35,7 @@ fn the_nearest_viewpoints_are_those_of_sorting_them_all() {
             let mut expected: Vec<usize> = (0..count).collect();
             expected.sort_by(|&a, &b| distance(&views[a]).total_cmp(&distance(&views[b])));
             expected.truncate(7);
-            let got = select_nearest(views.iter(), &here, metres_per_radian, 7);
+            let got = select_nearest(views.iter(), &here, metres_per_radian, 7, f64::INFINITY);
             assert_eq!(got, expected, "{count} views, {metres_per_radian} m/rad");
         }
     }
@@ -44,7 +44,13 @@ fn the_nearest_viewpoints_are_those_of_sorting_them_all() {
 #[test]
 fn equally_near_viewpoints_are_taken_in_their_order() {
     let views = vec![pose([0.1, 0.0, 0.0], [0.0; 3]); 20];
-    let got = select_nearest(views.iter(), &pose([0.0; 3], [0.0; 3]), 1.0, 7);
+    let got = select_nearest(
+        views.iter(),
+        &pose([0.0; 3], [0.0; 3]),
+        1.0,
+        7,
+        f64::INFINITY,
+    );
     assert_eq!(got, [0, 1, 2, 3, 4, 5, 6]);
 }
 
@@ -125,4 +131,19 @@ fn where_nothing_can_be_compared_the_gain_is_one() {
         };
         assert_eq!(rows.gain(), 1.0);
     }
+}
+
+#[test]
+fn views_beyond_the_limit_are_left_out_but_for_the_nearest_three() {
+    let at = |x: f64| pose([x, 0.0, 0.0], [0.0; 3]);
+    let near: Vec<Pose> = [0.0, 0.05, 0.1, 0.15, 0.2, 0.3].map(at).into();
+    assert_eq!(
+        select_nearest(near.iter(), &at(0.0), 1.0, 7, 0.16),
+        [0, 1, 2, 3]
+    );
+    let far: Vec<Pose> = [1.3, 1.0, 1.1, 1.2].map(at).into();
+    assert_eq!(
+        select_nearest(far.iter(), &at(0.0), 1.0, 7, 0.16),
+        [1, 2, 3]
+    );
 }

@@ -155,7 +155,6 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             edge_variance_px,
             surprise_threshold,
             depth_vote_tolerance,
-            mesh_cut,
             gamma_center,
             gamma_scale,
             second_look,
@@ -237,6 +236,10 @@ fn all_rust_constants() -> BTreeMap<String, Vec<f64>> {
     for folder in ["stages", "model", "engine"] {
         walk(&source.join(folder), &mut found);
     }
+    rust_constants(
+        &std::fs::read_to_string(source.join("lanes.rs")).unwrap(),
+        &mut found,
+    );
     // Not written as numbers there.
     found.insert("LOG2_E".into(), vec![std::f64::consts::LOG2_E]);
     found.insert("BIAS_SCALE".into(), vec![2f64.powi(112)]);

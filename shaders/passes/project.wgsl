@@ -1,9 +1,8 @@
 // One thread a quad of a viewpoint: its candidate pixels are tested against the triangle on their side of the diagonal.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
-@group(0) @binding(1) var<uniform> rules: Rules;
 @group(0) @binding(2) var<uniform> views: array<View, VIEWS_MAX>;
-@group(0) @binding(3) var<storage, read> depth_arena: array<f32>;
+@group(0) @binding(3) var<storage, read> depth_arena: array<u32>;
 /// Inverse depth of the nearest surface, a map a view; 0 = the viewpoint does not see the pixel.
 @group(0) @binding(4) var<storage, read_write> nearest: array<atomic<u32>>;
 /// The triangle there, counted from 1.

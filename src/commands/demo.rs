@@ -4,7 +4,7 @@ use anyhow::Context;
 use tokio::sync::watch;
 
 use super::{
-    fleet::{self, Network, PaceOptions, WorldOptions},
+    fleet::{self, Network, PaceOptions, Sensors, WorldOptions},
     options::ServiceOptions,
     serve::stop_signal,
 };
@@ -17,6 +17,10 @@ pub struct Demo {
     world: WorldOptions,
     #[command(flatten)]
     pace: PaceOptions,
+    /// Robots with three cameras and tracked markers, as the paper's, instead of depth cameras: rendering two of them and
+    /// computing their depth in real time takes four cores.
+    #[arg(long)]
+    rig: bool,
     /// Print one last line of JSON.
     #[arg(long)]
     json: bool,
@@ -35,6 +39,11 @@ impl Demo {
             // The robots are in this process; others may be let in with --listen.
             options.zenoh.listen = vec!["tcp/127.0.0.1:0".to_owned()];
         }
+        let sensors = if self.rig {
+            Sensors::Rig
+        } else {
+            Sensors::Depth
+        };
         let root = options.root.clone();
         let service = Service::start(options).await?;
         let endpoint = service
@@ -80,6 +89,7 @@ impl Demo {
         let driven = fleet::drive(
             self.world.script(),
             self.world.frames,
+            sensors,
             &self.pace,
             &network,
             stop,

@@ -3,6 +3,8 @@
 //! In the recording `revisit` a TV changes by itself: `--ignore-world 0.58,-1.42,2.90,0.5` leaves it out. The ball lies
 //! around its bezel, placed by the depth there at 2004.43 s; the screen itself has no depth and is never predicted.
 
+mod depth;
+
 use std::{
     fmt::Write as _,
     fs,
@@ -32,7 +34,12 @@ use crate::{
 #[derive(Debug, clap::Args)]
 pub struct EvaluateArgs {
     /// A recording in TUM RGB-D layout, or a folder of them (runs of one place, in the order of their names).
-    dir: PathBuf,
+    #[arg(required_unless_present = "depth")]
+    dir: Option<PathBuf>,
+    /// Judge computed depth instead, on a folder with left.png, middle.png, right.png and disparity.png (value / 16 =
+    /// pixels), or `simulated`: frames of the tabletop script.
+    #[arg(long, value_name = "DIR|simulated", conflicts_with_all = ["dir", "csv", "figures", "leave_one_out"])]
+    depth: Option<String>,
     #[arg(long, value_enum, default_value_t)]
     preset: Preset,
     /// A setting by name; may be repeated.
@@ -59,7 +66,7 @@ pub struct EvaluateArgs {
     /// The same in degrees.
     #[arg(long, value_name = "SD", default_value_t = 0.0)]
     pose_noise_deg: f64,
-    /// Of the noise.
+    /// Of the noise, and of what is simulated.
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// A ball in the world, metres, where change is not counted as a false alarm, as a screen's; may be repeated.
@@ -121,7 +128,14 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         })
         .transpose()?;
     let settings = Settings::layered(arguments.preset, file.as_deref(), &arguments.pairs)?;
-    let recordings = dataset::open(&arguments.dir)?;
+    if let Some(what) = &arguments.depth {
+        return depth::run(what, &settings, arguments.seed, arguments.json);
+    }
+    let dir = arguments
+        .dir
+        .as_deref()
+        .context("name a recording to evaluate, or --depth")?;
+    let recordings = dataset::open(dir)?;
     if let Some(folder) = &arguments.figures {
         fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     }
@@ -167,7 +181,7 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
     }
     if arguments.json {
         let report = serde_json::json!({
-            "recording": arguments.dir.display().to_string(),
+            "recording": dir.display().to_string(),
             "settings": settings,
             "methods": outcomes,
         });

@@ -19,7 +19,7 @@ use tokio::{
 
 use crate::{
     model::{
-        frame::{Frame, Source},
+        frame::{DepthSource, Frame, RgbImage, RigFrame, Source},
         report::PixelBox,
     },
     service::{
@@ -29,6 +29,7 @@ use crate::{
     simulation::{
         judge::{Judge, Verdict},
         script::{Capture, FRAMES_PER_SECOND, Script, Views},
+        tracker::Marker,
     },
     wire::{
         keys::{self, CameraPath},
@@ -99,6 +100,15 @@ fn rate(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "a rate lies between 0.01 and 1000 frames per second".to_owned())
 }
 
+/// What the robots' heads carry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sensors {
+    /// A depth camera; the robot tells its pose.
+    Depth,
+    /// Three cameras and a tracked plate (the paper's Fig. 3): depth and pose are the service's to find.
+    Rig,
+}
+
 /// Where the robots publish.
 #[derive(Debug, Clone)]
 pub struct Network {
@@ -158,6 +168,7 @@ enum News {
 pub async fn drive(
     script: Script,
     frames: Option<u64>,
+    sensors: Sensors,
     pace: &PaceOptions,
     network: &Network,
     stop: watch::Receiver<bool>,
@@ -174,6 +185,7 @@ pub async fn drive(
             frames: frames.or(script.frames).unwrap_or(u64::MAX),
             hz: pace.rate.unwrap_or(FRAMES_PER_SECOND),
             lockstep: pace.lockstep,
+            sensors,
             network: network.clone(),
             news: sender.clone(),
             unanswered: BTreeMap::new(),
@@ -285,6 +297,7 @@ struct Camera {
     frames: u64,
     hz: f64,
     lockstep: bool,
+    sensors: Sensors,
     network: Network,
     news: mpsc::Sender<News>,
     /// By sequence.
@@ -323,15 +336,24 @@ impl Camera {
                     break;
                 }
             }
-            let Some(frame) = frame(&self.script, self.station, &capture, epoch_ns) else {
-                // The tracker lost the plate: the robot does not know where it is.
-                continue;
-            };
+            let stamp_ns = capture.stamp_ns + epoch_ns;
+            let file = Some(jpeg(&capture.middle.image)?);
+            match self.sensors {
+                Sensors::Depth => match self.frame(&capture, stamp_ns) {
+                    Some(frame) => robot.publish(&frame, file).await?,
+                    // The tracker lost the plate: the robot does not know where it is.
+                    None => continue,
+                },
+                Sensors::Rig => {
+                    if let Some(frame) = rig_frame(&capture, stamp_ns) {
+                        let calibration = station.rig.calibration();
+                        robot.publish_rig(&frame, &calibration, file).await?;
+                    }
+                }
+            }
             robot
-                .publish_truth(&truth(&self.script, &capture, frame.stamp_ns))
+                .publish_truth(&truth(&self.script, &capture, stamp_ns))
                 .await?;
-            let file = jpeg(&frame)?;
-            robot.publish(&frame, Some(file)).await?;
             self.unanswered.insert(number, capture);
             while self.unanswered.len() > UNANSWERED_MAX {
                 self.unanswered.pop_first();
@@ -347,7 +369,30 @@ impl Camera {
 
     fn render(&self, number: u64) -> tokio::task::JoinHandle<Capture> {
         let (script, station) = (self.script.clone(), self.station);
-        tokio::task::spawn_blocking(move || script.capture(station, number, Views::Middle))
+        let views = match self.sensors {
+            Sensors::Depth => Views::Middle,
+            Sensors::Rig => Views::Triple,
+        };
+        tokio::task::spawn_blocking(move || script.capture(station, number, views))
+    }
+
+    /// As a robot with a depth camera has it: depth as measured, pose from its own tracker; `None` where that has none.
+    fn frame(&self, capture: &Capture, stamp_ns: i64) -> Option<Frame> {
+        let at = &self.script.stations[self.station];
+        let (world_from_camera, _) = self.script.localised(self.station, capture).ok()?;
+        Some(Frame {
+            source: Source {
+                robot: at.robot.as_str().into(),
+                camera: at.camera.as_str().into(),
+            },
+            stamp_ns,
+            sequence: capture.sequence,
+            image: capture.middle.image.clone(),
+            depth: DepthSource::Given(capture.depth_m.clone()),
+            intrinsics: at.rig.intrinsics,
+            world_from_camera,
+            pose_noise: None,
+        })
     }
 
     async fn tell(&self, news: News) -> anyhow::Result<()> {
@@ -411,27 +456,20 @@ impl Camera {
     }
 }
 
-/// As the robot has it: depth as measured, pose from the tracked LEDs; `None` where these give none.
-fn frame(script: &Script, station: usize, capture: &Capture, epoch_ns: i64) -> Option<Frame> {
-    let at = &script.stations[station];
-    let (world_from_camera, _) = script.localised(station, capture).ok()?;
-    Some(Frame {
-        source: Source {
-            robot: at.robot.as_str().into(),
-            camera: at.camera.as_str().into(),
-        },
-        stamp_ns: capture.stamp_ns + epoch_ns,
+/// What the rig's three cameras and the tracker saw; `None` where only the middle camera was rendered.
+fn rig_frame(capture: &Capture, stamp_ns: i64) -> Option<RigFrame> {
+    let (left, right) = capture.sides.as_ref()?;
+    Some(RigFrame {
+        stamp_ns,
         sequence: capture.sequence,
         image: capture.middle.image.clone(),
-        depth_m: capture.depth_m.clone(),
-        intrinsics: at.rig.intrinsics,
-        world_from_camera,
-        pose_noise: None,
+        left: left.image.grey(),
+        right: right.image.grey(),
+        marker_in_world: capture.markers.iter().map(Marker::tracked).collect(),
     })
 }
 
-fn jpeg(frame: &Frame) -> anyhow::Result<PictureFile> {
-    let image = &frame.image;
+fn jpeg(image: &RgbImage) -> anyhow::Result<PictureFile> {
     let mut bytes = Vec::new();
     JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY).encode(
         &image.data,

@@ -2,11 +2,10 @@
 
 use std::path::PathBuf;
 
-use anyhow::bail;
 use tokio::sync::watch;
 
 use super::{
-    fleet::{self, Network, PaceOptions, WorldOptions},
+    fleet::{self, Network, PaceOptions, Sensors, WorldOptions},
     replay::id,
 };
 use crate::{service::session::ZenohOptions, simulation::write};
@@ -21,7 +20,8 @@ pub struct Simulate {
     world: WorldOptions,
     #[command(flatten)]
     pace: PaceOptions,
-    /// Send measured depth, as a depth camera does.
+    /// Send measured depth and the robot's own pose, as a robot with a depth camera does; without it three images and the
+    /// tracked markers, as the paper's robot does.
     #[arg(long)]
     depth: bool,
     /// Write the first robot's recording to this folder in TUM RGB-D layout, with masks, instead of publishing.
@@ -58,9 +58,11 @@ impl Simulate {
             println!("{}: {summary:?}", folder.display());
             return Ok(());
         }
-        if !self.depth {
-            bail!("robots send their depth so far: add --depth");
-        }
+        let sensors = if self.depth {
+            Sensors::Depth
+        } else {
+            Sensors::Rig
+        };
         let (stopper, stop) = watch::channel(false);
         let signals = super::serve::stop_signal()?;
         tokio::spawn(async move {
@@ -72,7 +74,15 @@ impl Simulate {
             root: self.root,
             place: self.place,
         };
-        let summary = fleet::drive(script, self.world.frames, &self.pace, &network, stop).await?;
+        let summary = fleet::drive(
+            script,
+            self.world.frames,
+            sensors,
+            &self.pace,
+            &network,
+            stop,
+        )
+        .await?;
         println!("{summary}");
         if self.json {
             println!("{}", serde_json::to_string(&summary)?);

@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 use crate::model::{
     camera::Intrinsics,
-    frame::{Frame, RgbImage, Source},
+    frame::{DepthSource, Frame, RgbImage, Source},
     pose::Pose,
 };
 
@@ -209,11 +209,13 @@ impl Recording {
                 height: self.intrinsics.height,
                 data: rgb.into_raw(),
             },
-            depth_m: depth
-                .into_raw()
-                .into_iter()
-                .map(|steps| f32::from(steps) / DEPTH_SCALE)
-                .collect(),
+            depth: DepthSource::Given(
+                depth
+                    .into_raw()
+                    .into_iter()
+                    .map(|steps| f32::from(steps) / DEPTH_SCALE)
+                    .collect(),
+            ),
             intrinsics: self.intrinsics,
             world_from_camera: entry.world_from_camera,
             pose_noise: None,

@@ -1,7 +1,5 @@
 //! Where interpolation and surprise are computed.
 
-pub mod isa;
-
 pub mod cpu;
 
 pub mod gpu;
@@ -12,7 +10,14 @@ use rayon::ThreadPool;
 
 use crate::{
     config::{Evidence, Settings},
-    model::{camera::Intrinsics, frame::RgbImage, pose::Pose, viewpoint::Viewpoint},
+    isa::Isa,
+    model::{
+        belief::Record,
+        camera::Intrinsics,
+        frame::RgbImage,
+        pose::Pose,
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
+    },
     stages::{
         attend::BlockMap,
         interpolate::prior::{self, Prior},
@@ -22,7 +27,6 @@ use crate::{
 use self::{
     cpu::{CpuEngine, Observation, RecallView, Score},
     gpu::GpuEngine,
-    isa::Isa,
 };
 
 /// Which engine is asked for.
@@ -58,11 +62,19 @@ pub struct Question<'a> {
     pub observation: &'a Observation,
 }
 
-/// What is known of every compared image.
+/// Where the answer goes; memory that is there is used again.
+pub struct Answer<'a> {
+    pub prior: &'a mut Prior,
+    pub score: &'a mut Score,
+    /// What regions and thresholds look at, nats.
+    pub evidence: &'a mut BlockMap,
+    /// Working memory.
+    pub blocks: &'a mut BlockMap,
+}
+
+/// What is known of every compared image, beside its evidence.
 #[derive(Debug, Clone)]
 pub struct Compared {
-    /// What regions and thresholds look at, nats.
-    pub evidence: BlockMap,
     /// Pixels that some viewpoint saw.
     pub seen: usize,
     /// Whether prior and score are whole; else [`Engine::maps`] completes them.
@@ -113,24 +125,43 @@ impl Engine {
         question: &Question,
         evidence: Evidence,
         learn: bool,
-        prior: &mut Prior,
-        score: &mut Score,
+        mut answer: Answer<'_>,
     ) -> Result<Compared, EngineError> {
         let gpu = match self {
             Self::Cpu(engine) => {
                 return Ok(compare_on_processor(
-                    engine, question, evidence, prior, score,
+                    engine,
+                    question,
+                    evidence,
+                    &mut answer,
                 ));
             }
             Self::Gpu(gpu) => gpu,
         };
-        match gpu.compare(question, learn, prior, score) {
+        match gpu.compare(question, learn, &mut answer) {
             Err(error) if gpu.falls_back() => {
                 tracing::error!(%error, "going on with the processor");
                 *self = Self::Cpu(gpu.fallback());
-                self.compare(question, evidence, learn, prior, score)
+                self.compare(question, evidence, learn, answer)
             }
             result => result,
+        }
+    }
+
+    /// Takes an image apart into planes; memory that is there is used again.
+    pub fn observe(&self, image: &RgbImage, observation: &mut Observation) {
+        self.processor().observe(image, observation);
+    }
+
+    /// Makes what follows from a mesh's depth and its records when they are stored.
+    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+        self.processor().prepare(mesh, records, coarse, cut);
+    }
+
+    fn processor(&self) -> &CpuEngine {
+        match self {
+            Self::Cpu(engine) => engine,
+            Self::Gpu(gpu) => gpu.processor(),
         }
     }
 
@@ -179,9 +210,14 @@ fn compare_on_processor(
     engine: &CpuEngine,
     question: &Question,
     evidence: Evidence,
-    prior: &mut Prior,
-    score: &mut Score,
+    answer: &mut Answer,
 ) -> Compared {
+    let Answer {
+        prior,
+        score,
+        evidence: found,
+        blocks,
+    } = answer;
     engine.recall(
         question.views,
         question.intrinsics,
@@ -189,8 +225,8 @@ fn compare_on_processor(
         prior,
     );
     engine.score(prior, question.observation, score);
+    found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {
-        evidence: BlockMap::evidence(&score.surprise, prior.width, evidence),
         seen: prior
             .plane(prior::COVERAGE)
             .filter(|&count| count > 0.0)

@@ -10,11 +10,9 @@ use rayon::ThreadPool;
 
 use crate::{
     config::{Evidence, Settings},
-    engine::{
-        cpu::{CpuEngine, Observation, RecallView},
-        isa::Isa,
-    },
+    engine::cpu::{CpuEngine, Observation, RecallView},
     evaluation::method::Verdict,
+    isa::Isa,
     memory::Memory,
     model::{
         belief::{Belief, CHANNELS, Record},
@@ -114,11 +112,13 @@ impl Differencing {
     /// Scores a frame and, if told to, stores it.
     ///
     /// # Errors
-    /// None that a pipeline would not find; the recording's frames have image and depth of one size.
+    /// None that a pipeline would not find; the recording's frames have image and given depth of one size.
     pub fn judge(&mut self, frame: &Frame, learn: bool) -> Result<Verdict, FrameError> {
         let range = self.settings.depth_min_m..=self.settings.depth_max_m;
-        let depth_m: Vec<f32> = frame
-            .depth_m
+        let Some(given_m) = frame.depth.given_m() else {
+            return Err(FrameError::NoDepth { valid_percent: 0.0 });
+        };
+        let depth_m: Vec<f32> = given_m
             .iter()
             .map(|&z| if range.contains(&z) { z } else { 0.0 })
             .collect();

@@ -45,7 +45,10 @@ impl Verdict {
             ..settings.clone()
         };
         let scene = Scene {
-            depth_m: &frame.depth_m,
+            depth_m: frame
+                .depth
+                .given_m()
+                .expect("a recording's frames have depth"),
             intrinsics: &frame.intrinsics,
             world_from_camera: &self.world_from_camera,
         };

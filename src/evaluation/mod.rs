@@ -17,3 +17,5 @@ pub mod figures;
 pub mod table;
 
 pub mod stereo;
+
+pub mod simulated_depth;

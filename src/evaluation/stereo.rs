@@ -2,11 +2,12 @@
 //! (2002) count it.
 
 use crate::{
-    model::{camera::Intrinsics, pose::Pose},
+    model::{camera::Intrinsics, frame::luminance, pose::Pose},
     stages::depth::{
         DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera,
     },
 };
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 
 /// Three images of a rectified rig with equal distances, and what is true.
@@ -83,9 +84,9 @@ impl StereoScene {
         Ok(Self {
             width: expected.0 as usize,
             height: expected.1 as usize,
-            left_y: luminance(&left),
-            middle_y: luminance(&middle),
-            right_y: luminance(&right),
+            left_y: grey(&left),
+            middle_y: grey(&middle),
+            right_y: grey(&right),
             disparity,
         })
     }
@@ -131,14 +132,11 @@ impl StereoScene {
     }
 }
 
-fn luminance(image: &image::DynamicImage) -> Vec<u8> {
+fn grey(image: &image::DynamicImage) -> Vec<u8> {
     image
         .to_rgb8()
         .pixels()
-        .map(|pixel| {
-            let [r, g, b] = pixel.0.map(f32::from);
-            (0.299 * r + 0.587 * g + 0.114 * b).round() as u8
-        })
+        .map(|pixel| luminance(pixel.0))
         .collect()
 }
 
@@ -151,7 +149,7 @@ pub enum Cameras {
 
 /// Shares of pixels, percent. All are over the dense labelling: a pixel without depth counts by its best guess, but
 /// for `invalid`.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct BadPixels {
     /// Wrong by more than one pixel between neighbouring cameras.
     pub bad_over_1px: f64,

@@ -82,7 +82,12 @@ impl Memory {
 
     /// Puts a viewpoint where [`Self::slot`] said and returns its id. A new viewpoint gets a new id; an updated one keeps
     /// its id and its home, and counts the update.
-    pub fn write(&mut self, slot: Slot, mut viewpoint: Viewpoint) -> u64 {
+    pub fn write(&mut self, slot: Slot, viewpoint: Viewpoint) -> u64 {
+        self.replace(slot, viewpoint).0
+    }
+
+    /// As [`Self::write`], and gives back what was there before.
+    pub fn replace(&mut self, slot: Slot, mut viewpoint: Viewpoint) -> (u64, Option<Viewpoint>) {
         if let Slot::Overwrite(index) = slot {
             let old = &self.viewpoints[index];
             viewpoint.id = old.id;
@@ -95,14 +100,18 @@ impl Memory {
         }
         let id = viewpoint.id;
         self.bytes += viewpoint.bytes();
-        match slot {
-            Slot::Append => self.viewpoints.push(viewpoint),
-            Slot::Overwrite(index) | Slot::Reuse(index) => {
-                self.bytes -= self.viewpoints[index].bytes();
-                self.viewpoints[index] = viewpoint;
-                self.replaced_for_room += u64::from(matches!(slot, Slot::Reuse(_)));
+        let old = match slot {
+            Slot::Append => {
+                self.viewpoints.push(viewpoint);
+                None
             }
-        }
-        id
+            Slot::Overwrite(index) | Slot::Reuse(index) => {
+                let old = std::mem::replace(&mut self.viewpoints[index], viewpoint);
+                self.bytes -= old.bytes();
+                self.replaced_for_room += u64::from(matches!(slot, Slot::Reuse(_)));
+                Some(old)
+            }
+        };
+        (id, old)
     }
 }

@@ -5,6 +5,8 @@
 //! it is no standard deviation. `alpha` does not depend on the data, so one value serves Y, Cb and Cr.
 //! A second appearance (`tau2`, with weight `p2`) remembers what was there before a change.
 
+use crate::lanes::{LANES, Lanes};
+
 /// Y, Cb, Cr.
 pub const CHANNELS: usize = 3;
 
@@ -20,6 +22,27 @@ pub struct Belief {
     pub tau2: [f32; CHANNELS],
     /// How much still speaks for `tau2`, 0..1.
     pub p2: f32,
+}
+
+/// Sixteen beliefs with one appearance, a plane a value.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct BeliefLanes {
+    pub alpha: Lanes,
+    pub beta: [Lanes; CHANNELS],
+    pub tau: [Lanes; CHANNELS],
+    pub sigma: [Lanes; CHANNELS],
+}
+
+impl BeliefLanes {
+    pub fn at(&self, lane: usize) -> Belief {
+        Belief {
+            alpha: self.alpha[lane],
+            beta: self.beta.map(|plane| plane[lane]),
+            tau: self.tau.map(|plane| plane[lane]),
+            sigma: self.sigma.map(|plane| plane[lane]),
+            ..Belief::default()
+        }
+    }
 }
 
 /// A belief as stored: 32 bytes, so that one aligned load brings a pixel.
@@ -58,8 +81,7 @@ impl Record {
             .map(|value| f16_from_f32(value.clamp(SPREAD_MIN, SPREAD_MAX)));
         let mut level = [0; 8];
         for (lane, value) in [t0, t1, t2, e0, e1, e2].into_iter().enumerate() {
-            // The cast saturates.
-            level[lane] = ((value - LEVEL_OFFSET[lane]) * LEVEL_SCALE).round_ties_even() as i16;
+            level[lane] = level_from(value - LEVEL_OFFSET[lane]);
         }
         Self {
             spread: [
@@ -73,6 +95,40 @@ impl Record {
                 f16_from_f32(belief.p2.clamp(0.0, 1.0)),
             ],
             level,
+        }
+    }
+
+    /// The same bits as [`Self::pack`].
+    #[inline(always)]
+    pub fn pack_lanes(beliefs: &BeliefLanes, records: &mut [Self; LANES]) {
+        let mut spread = [[0u16; LANES]; 8];
+        let planes = [
+            &beliefs.alpha,
+            &beliefs.beta[0],
+            &beliefs.beta[1],
+            &beliefs.beta[2],
+            &beliefs.sigma[0],
+            &beliefs.sigma[1],
+            &beliefs.sigma[2],
+        ];
+        for (packed, plane) in spread.iter_mut().zip(planes) {
+            for lane in 0..LANES {
+                packed[lane] = f16_from_f32(plane[lane].clamp(SPREAD_MIN, SPREAD_MAX));
+            }
+        }
+        // The second appearance is at its stored zero.
+        let mut level = [[0i16; LANES]; 8];
+        for (channel, (packed, plane)) in level.iter_mut().zip(&beliefs.tau).enumerate() {
+            for lane in 0..LANES {
+                packed[lane] = level_from(plane[lane] - LEVEL_OFFSET[channel]);
+            }
+        }
+        level[CHANNELS] = [level_from(-LEVEL_OFFSET[CHANNELS]); LANES];
+        for (lane, record) in records.iter_mut().enumerate() {
+            for k in 0..8 {
+                record.spread[k] = spread[k][lane];
+                record.level[k] = level[k][lane];
+            }
         }
     }
 
@@ -92,6 +148,15 @@ impl Record {
             tau2: [level[3], level[4], level[5]],
         }
     }
+}
+
+/// Nearest step, ties to even; saturates.
+#[inline(always)]
+fn level_from(value: f32) -> i16 {
+    // 1.5 * 2^23: adding it leaves the nearest integer in the low bits.
+    const ROUND: f32 = 12_582_912.0;
+    let steps = (value * LEVEL_SCALE).clamp(i16::MIN.into(), i16::MAX.into());
+    ((steps + ROUND).to_bits() as i32 - ROUND.to_bits() as i32) as i16
 }
 
 /// 2^112: the difference of the exponent biases of f32 and f16.

@@ -2,8 +2,10 @@
 
 use nalgebra::{Matrix3, Point3};
 
+use super::pose::Pose;
+
 /// Of a rectified image: `u = fx * x/z + cx`, pixels.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Intrinsics {
     pub width: usize,
     pub height: usize,
@@ -66,10 +68,52 @@ pub struct PlumbBob {
     pub k3: f64,
 }
 
-/// What is fixed about one camera of a robot.
+/// What is fixed about one camera.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Calibration {
     pub intrinsics: Intrinsics,
     /// `None`: the images are rectified.
     pub distortion: Option<PlumbBob>,
+}
+
+/// What is fixed about a camera of a robot: alone, or in the middle of a rig (the paper's Fig. 3).
+#[derive(Debug, Clone, PartialEq)]
+pub struct RigCalibration {
+    /// Of the camera whose images are remembered.
+    pub middle: Calibration,
+    /// The cameras beside it, for depth.
+    pub sides: Option<SideCalibrations>,
+    /// The tracked plate above them, for poses.
+    pub plate: Option<Plate>,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct SideCalibrations {
+    pub left: SideCalibration,
+    pub right: SideCalibration,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct SideCalibration {
+    pub camera: Calibration,
+    pub middle_from_side: Pose,
+}
+
+/// Markers that an optical tracker follows.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Plate {
+    /// Metres.
+    pub marker_in_plate: Vec<Point3<f64>>,
+    pub camera_from_plate: Pose,
+}
+
+impl From<Calibration> for RigCalibration {
+    /// A camera alone.
+    fn from(middle: Calibration) -> Self {
+        Self {
+            middle,
+            sides: None,
+            plate: None,
+        }
+    }
 }

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use nalgebra::Point3;
+
 use super::{
     camera::Intrinsics,
     pose::{Pose, PoseNoise},
@@ -22,6 +24,83 @@ pub struct RgbImage {
     pub data: Vec<u8>,
 }
 
+/// The luminance Y of JPEG 2000's and JPEG's colour transforms, rounded to whole grey levels.
+pub fn luminance(rgb: [u8; 3]) -> u8 {
+    let [r, g, b] = rgb.map(f32::from);
+    (0.299 * r + 0.587 * g + 0.114 * b).round() as u8
+}
+
+impl RgbImage {
+    pub fn grey(&self) -> GreyImage {
+        GreyImage {
+            width: self.width,
+            height: self.height,
+            data: self
+                .data
+                .as_chunks()
+                .0
+                .iter()
+                .map(|&rgb| luminance(rgb))
+                .collect(),
+        }
+    }
+}
+
+/// Row by row, one byte a pixel: luminance.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GreyImage {
+    pub width: usize,
+    pub height: usize,
+    pub data: Vec<u8>,
+}
+
+/// Where a frame's depth comes from.
+#[derive(Debug, Clone)]
+pub enum DepthSource {
+    /// Metres along the optical axis, as many as the image has pixels; 0 = none.
+    Given(Vec<f32>),
+    /// It is computed from what two more cameras saw.
+    Sides(Box<Sides>),
+}
+
+impl DepthSource {
+    /// `None` where it has yet to be computed.
+    pub fn given_m(&self) -> Option<&[f32]> {
+        match self {
+            Self::Given(depth_m) => Some(depth_m),
+            Self::Sides(_) => None,
+        }
+    }
+}
+
+/// What the cameras beside the middle one saw at the same instant.
+#[derive(Debug, Clone)]
+pub struct Sides {
+    pub left: SideView,
+    pub right: SideView,
+}
+
+/// Undistorted.
+#[derive(Debug, Clone)]
+pub struct SideView {
+    pub image: GreyImage,
+    pub intrinsics: Intrinsics,
+    pub middle_from_side: Pose,
+}
+
+/// What a rig of three cameras with a tracked plate sends: neither depth nor pose, but what both follow from.
+#[derive(Debug, Clone)]
+pub struct RigFrame {
+    /// Capture time, nanoseconds since the epoch.
+    pub stamp_ns: i64,
+    pub sequence: u64,
+    pub image: RgbImage,
+    pub left: GreyImage,
+    pub right: GreyImage,
+    /// Metres, in the calibration's order; `None` where the tracker does not see the marker.
+    pub marker_in_world: Vec<Option<Point3<f64>>>,
+}
+
 /// Decoded, checked and undistorted; image and depth have the size that `intrinsics` says.
 #[derive(Debug, Clone)]
 pub struct Frame {
@@ -31,8 +110,7 @@ pub struct Frame {
     /// The robot's own count of its frames.
     pub sequence: u64,
     pub image: RgbImage,
-    /// Metres along the optical axis; 0 = none.
-    pub depth_m: Vec<f32>,
+    pub depth: DepthSource,
     pub intrinsics: Intrinsics,
     pub world_from_camera: Pose,
     /// `None`: as the settings say.
@@ -50,6 +128,24 @@ pub enum FrameError {
         image_height: usize,
         width: usize,
         height: usize,
+    },
+    #[error(
+        "the {side} image has {got_width}x{got_height} pixels but its calibration says {width}x{height}: send the calibration of this rig"
+    )]
+    SideSize {
+        side: &'static str,
+        got_width: usize,
+        got_height: usize,
+        width: usize,
+        height: usize,
+    },
+    #[error(
+        "depth of {pixels} pixels with depth_labels = {labels} takes more memory than a place may use for it: send smaller images, or lower the setting until their product is at most {most}"
+    )]
+    DepthTooLarge {
+        pixels: usize,
+        labels: usize,
+        most: usize,
     },
     #[error("the depth has {got} pixels but the image {expected}: register the depth to the image")]
     DepthSize { got: usize, expected: usize },
@@ -75,6 +171,8 @@ impl FrameError {
     pub fn code(&self) -> &'static str {
         match self {
             Self::ImageSize { .. } => "image_size",
+            Self::SideSize { .. } => "side_size",
+            Self::DepthTooLarge { .. } => "depth_too_large",
             Self::DepthSize { .. } => "depth_size",
             Self::NoDepth { .. } => "no_depth",
             Self::DepthUnit { .. } => "depth_unit",

@@ -1,70 +1,139 @@
 //! A viewpoint: a stored pose with depth map, mesh and one belief a pixel (the paper's reference parameter image).
 
-use super::{belief::Record, camera::Intrinsics, frame::Source, pose::Pose};
+use crate::lanes::LANES;
+
+use super::{
+    belief::{LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
+    camera::Intrinsics,
+    frame::Source,
+    pose::Pose,
+};
 
 /// Bits of [`Mesh::cut`]: which of a quad's two triangles exist.
 pub const UPPER_LEFT: u8 = 1;
 pub const LOWER_RIGHT: u8 = 2;
 
+/// Where a mesh is cut: between neighbours whose depths differ by more than both say.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct MeshCut {
+    /// Of the nearer depth.
+    pub share: f32,
+    /// Of inverse depth, 1/m: how far two points of one surface may lie apart where depth is only known in steps of it.
+    pub inverse_depth: f32,
+}
+
+impl From<f32> for MeshCut {
+    /// For depth that is measured: the share alone.
+    fn from(share: f32) -> Self {
+        Self {
+            share,
+            inverse_depth: 0.0,
+        }
+    }
+}
+
+impl MeshCut {
+    #[inline(always)]
+    fn joins(self, z_min: f32, z_max: f32) -> bool {
+        let allowed = self.share.max(self.inverse_depth * z_max);
+        z_max - z_min <= allowed * z_min
+    }
+}
+
 /// The surface seen from a viewpoint: vertices at pixel centres, two triangles a quad, split from its upper right to
 /// its lower left corner.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Mesh {
     pub intrinsics: Intrinsics,
     /// Metres along the optical axis; 0 = none. `width * height`.
     pub depth_m: Vec<f32>,
     /// Triangles of the quad whose upper left vertex is this pixel; rows of `width - 1`.
     pub cut: Vec<u8>,
-    /// Least and greatest depth of each row's vertices; `(inf, 0)` for a row without any.
-    pub row_depth_m: Vec<(f32, f32)>,
+    /// Least and greatest depth of the vertices of sixteen quads of a row, rows of [`Self::blocks`]; `inf` and 0 without
+    /// any.
+    pub block_nearest_m: Vec<f32>,
+    pub block_farthest_m: Vec<f32>,
 }
 
 impl Mesh {
-    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`.
-    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: f32) -> Self {
-        let Intrinsics { width, height, .. } = intrinsics;
-        assert_eq!(depth_m.len(), width * height, "one depth a pixel");
-        let joined = |a: f32, b: f32, c: f32| {
-            let z_min = a.min(b).min(c);
-            let z_max = a.max(b).max(c);
-            z_min > 0.0 && z_max - z_min <= cut * z_min
-        };
-        let mut mask = Vec::with_capacity(width.saturating_sub(1) * height.saturating_sub(1));
-        // Half of a camera one pixel wide has no column, and no row then.
-        let rows = || depth_m.chunks_exact(width.max(1));
-        for (upper, lower) in rows().zip(rows().skip(1)) {
-            for (upper, lower) in upper.windows(2).zip(lower.windows(2)) {
-                let upper_left = joined(upper[0], upper[1], lower[0]);
-                let lower_right = joined(lower[1], lower[0], upper[1]);
-                mask.push(u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT);
-            }
-        }
-        let row_depth_m = rows()
-            .map(|row| {
-                row.iter()
-                    .filter(|&&z| z > 0.0)
-                    .fold((f32::INFINITY, 0.0f32), |(low, high), &z| {
-                        (low.min(z), high.max(z))
-                    })
-            })
-            .collect();
-        Self {
+    /// A triangle exists where its three vertices have depth and `z_max - z_min <= cut * z_min`, or their inverse depths
+    /// are as close as `cut` says.
+    pub fn new(intrinsics: Intrinsics, depth_m: Vec<f32>, cut: impl Into<MeshCut>) -> Self {
+        let mut mesh = Self {
             intrinsics,
             depth_m,
-            cut: mask,
-            row_depth_m,
+            ..Self::default()
+        };
+        mesh.join(cut.into());
+        mesh
+    }
+
+    /// Makes everything that follows from intrinsics and depth; memory that is there is used again.
+    #[inline(always)]
+    pub fn join(&mut self, cut: MeshCut) {
+        let Intrinsics { width, height, .. } = self.intrinsics;
+        assert_eq!(self.depth_m.len(), width * height, "one depth a pixel");
+        let blocks = self.blocks();
+        self.cut.clear();
+        self.cut
+            .resize(width.saturating_sub(1) * height.saturating_sub(1), 0);
+        for plane in [&mut self.block_nearest_m, &mut self.block_farthest_m] {
+            plane.clear();
+            plane.resize(blocks * height, 0.0);
         }
+        // Half of a camera one pixel wide has no column.
+        if blocks == 0 {
+            return;
+        }
+        let rows = || self.depth_m.chunks_exact(width);
+        let masks = self.cut.chunks_exact_mut(width - 1);
+        for ((upper, lower), mask) in rows().zip(rows().skip(1)).zip(masks) {
+            for column in 0..width - 1 {
+                let (a, b) = (upper[column], upper[column + 1]);
+                let (c, d) = (lower[column], lower[column + 1]);
+                // What both triangles share.
+                let (near, far) = (b.min(c), b.max(c));
+                let joined = |near: f32, far: f32| (near > 0.0) & cut.joins(near, far);
+                let upper_left = joined(near.min(a), far.max(a));
+                let lower_right = joined(near.min(d), far.max(d));
+                mask[column] =
+                    u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT;
+            }
+        }
+        let ranges = self
+            .block_nearest_m
+            .chunks_exact_mut(blocks)
+            .zip(self.block_farthest_m.chunks_exact_mut(blocks));
+        for (row, (nearest_m, farthest_m)) in rows().zip(ranges) {
+            for block in 0..blocks {
+                // Quads need the vertex to their right.
+                let vertices = &row[block * LANES..(block * LANES + LANES + 1).min(width)];
+                let (mut near, mut far) = (f32::INFINITY, 0.0f32);
+                for &z in vertices {
+                    near = near.min(if z > 0.0 { z } else { f32::INFINITY });
+                    far = far.max(z);
+                }
+                nearest_m[block] = near;
+                farthest_m[block] = far;
+            }
+        }
+    }
+
+    /// Blocks of sixteen quads in a row.
+    pub fn blocks(&self) -> usize {
+        self.intrinsics.width.saturating_sub(1).div_ceil(LANES)
     }
 
     fn bytes(&self) -> usize {
         size_of_val(self.depth_m.as_slice())
             + size_of_val(self.cut.as_slice())
-            + size_of_val(self.row_depth_m.as_slice())
+            + size_of_val(self.block_nearest_m.as_slice())
+            + size_of_val(self.block_farthest_m.as_slice())
     }
 }
 
 /// A viewpoint's luminance at half resolution: what poses are refined against. Follows from mesh and records.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Coarse {
     pub mesh: Mesh,
     /// Expected Y, a value a pixel of the mesh.
@@ -74,51 +143,82 @@ pub struct Coarse {
 }
 
 /// How many pixels of 2x2 must have depth, on one surface, for their mean to have it.
-const COARSE_DEPTHS_MIN: usize = 3;
+const COARSE_DEPTHS_MIN: f32 = 3.0;
 
 impl Coarse {
     /// Means over 2x2 pixels; `cut` as for [`Mesh::new`].
-    pub fn new(mesh: &Mesh, records: &[Record], cut: f32) -> Self {
+    pub fn new(mesh: &Mesh, records: &[Record], cut: impl Into<MeshCut>) -> Self {
+        let mut coarse = Self::default();
+        coarse.reduce(mesh, records, cut.into());
+        coarse
+    }
+
+    /// The same, using again the memory that is there.
+    #[inline(always)]
+    pub fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: MeshCut) {
         let fine = mesh.intrinsics;
         let coarse = fine.half();
-        let mut depth_m = Vec::with_capacity(coarse.pixels());
-        let mut luminance = Vec::with_capacity(coarse.pixels());
-        let mut variance = Vec::with_capacity(coarse.pixels());
+        self.mesh.intrinsics = coarse;
+        let depth_m = &mut self.mesh.depth_m;
+        for plane in [depth_m, &mut self.luminance, &mut self.variance] {
+            plane.resize(coarse.pixels(), 0.0);
+        }
         for y in 0..coarse.height {
-            for x in 0..coarse.width {
-                let first = 2 * y * fine.width + 2 * x;
-                let four = [first, first + 1, first + fine.width, first + fine.width + 1];
-                depth_m.push(coarse_depth_m(four.map(|pixel| mesh.depth_m[pixel]), cut));
-                let mut sums = (0.0, 0.0);
-                for pixel in four {
-                    let belief = records[pixel].unpack();
-                    sums.0 += belief.tau[0];
-                    sums.1 += belief.beta[0] / belief.alpha * (1.0 + belief.sigma[0]);
-                }
-                luminance.push(sums.0 / 4.0);
-                variance.push(sums.1 / 4.0);
-            }
+            let row = y * coarse.width..(y + 1) * coarse.width;
+            let upper = 2 * y * fine.width..(2 * y + 1) * fine.width;
+            let lower = (2 * y + 1) * fine.width..(2 * y + 2) * fine.width;
+            coarse_depth_row(
+                &mesh.depth_m[upper.clone()],
+                &mesh.depth_m[lower.clone()],
+                cut,
+                &mut self.mesh.depth_m[row.clone()],
+            );
+            coarse_luminance_row(
+                &records[upper],
+                &records[lower],
+                &mut self.luminance[row.clone()],
+                &mut self.variance[row],
+            );
         }
-        Self {
-            mesh: Mesh::new(coarse, depth_m, cut),
-            luminance,
-            variance,
-        }
+        self.mesh.join(cut);
     }
 }
 
-/// Mean of the depths that are there; 0 where they are too few or not on one surface.
-fn coarse_depth_m(four: [f32; 4], cut: f32) -> f32 {
-    let (mut count, mut sum, mut low, mut high) = (0, 0.0, f32::INFINITY, 0.0f32);
-    for z in four.into_iter().filter(|z| *z > 0.0) {
-        count += 1;
-        sum += z;
-        (low, high) = (low.min(z), high.max(z));
+/// Means of the depths that are there; 0 where they are too few or not on one surface.
+#[inline(always)]
+fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: MeshCut, coarse: &mut [f32]) {
+    let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
+    for (coarse, (upper, lower)) in coarse.iter_mut().zip(pairs) {
+        let (mut count, mut sum, mut near, mut far) = (0.0, 0.0, f32::INFINITY, 0.0f32);
+        for z in [upper[0], upper[1], lower[0], lower[1]] {
+            count += if z > 0.0 { 1.0 } else { 0.0 };
+            sum += z;
+            near = near.min(if z > 0.0 { z } else { f32::INFINITY });
+            far = far.max(z);
+        }
+        let joined = (count >= COARSE_DEPTHS_MIN) & cut.joins(near, far);
+        *coarse = if joined { sum / count } else { 0.0 };
     }
-    if count >= COARSE_DEPTHS_MIN && high - low <= cut * low {
-        sum / count as f32
-    } else {
-        0.0
+}
+
+#[inline(always)]
+fn coarse_luminance_row(
+    upper: &[Record],
+    lower: &[Record],
+    luminance: &mut [f32],
+    variance: &mut [f32],
+) {
+    let pairs = upper.chunks_exact(2).zip(lower.chunks_exact(2));
+    let coarse = luminance.iter_mut().zip(variance);
+    for ((luminance, variance), (upper, lower)) in coarse.zip(pairs) {
+        let (mut level, mut spread) = (0.0, 0.0);
+        for record in [&upper[0], &upper[1], &lower[0], &lower[1]] {
+            let [alpha, beta, _, _, sigma, ..] = record.spread.map(f32_from_f16);
+            level += f32::from(record.level[0]);
+            spread += beta / alpha * (1.0 + sigma);
+        }
+        *luminance = level * (0.25 / LEVEL_SCALE) + LEVEL_OFFSET[0];
+        *variance = spread / 4.0;
     }
 }
 

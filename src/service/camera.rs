@@ -1,30 +1,34 @@
 //! What a worker knows about one camera: its calibration, its poses, its clock, and the frame that waits for them.
 
 use std::{
+    collections::VecDeque,
     sync::Arc,
     time::{Duration, Instant},
 };
 
+use nalgebra::Point3;
+
 use super::{
     ask::{Answer, Snapshot},
-    inbox::Arrival,
+    inbox::{Arrival, POSES_MAX},
     publish::CameraPublisher,
     status::CameraStatus,
 };
 use crate::{
     model::{
-        camera::Calibration,
-        frame::{Frame, FrameError, RgbImage, Source},
+        camera::{RigCalibration, SideCalibration},
+        frame::{DepthSource, Frame, FrameError, GreyImage, RgbImage, SideView, Sides, Source},
         pose::{Pose, PoseNoise},
         refusal::Refusal,
     },
     stages::{
+        localise,
         pose_track::{PoseTrack, TrackedPose, goes_back},
         rectify::Rectifier,
         stamp_order::{Order, StampOrder},
     },
     wire::{
-        decode::{self, Limits, PackedFrame},
+        decode::{self, Limits, PackedFrame, PicturedDepth},
         keys::CameraPath,
         proto,
     },
@@ -47,7 +51,9 @@ pub struct Camera {
     pub served: u64,
     pub track: PoseTrack,
     pub waiting: Option<Waiting>,
-    calibration: Option<Lens>,
+    calibration: Option<Arc<Lenses>>,
+    /// Markers whose plate is not known yet: stamps and positions in the world.
+    markers: VecDeque<(i64, Markers)>,
     calibration_asked: Option<Instant>,
     order: StampOrder,
     /// Sequence of the last frame that could be read, refused or not.
@@ -58,20 +64,52 @@ pub struct Camera {
     watchers: Vec<Answer<Arc<Snapshot>>>,
 }
 
-/// A calibration with the map that follows from it.
-#[derive(Debug, Clone)]
-struct Lens {
-    calibration: Calibration,
-    rectifier: Option<Arc<Rectifier>>,
+type Markers = Vec<Option<Point3<f64>>>;
+
+/// A calibration with the maps that follow from it.
+#[derive(Debug)]
+pub struct Lenses {
+    calibration: RigCalibration,
+    middle: Option<Rectifier>,
+    /// Left and right.
+    sides: [Option<Rectifier>; 2],
 }
 
-impl Lens {
-    fn new(calibration: Calibration) -> Self {
-        Self {
-            rectifier: Rectifier::new(&calibration).map(Arc::new),
+impl Lenses {
+    /// # Errors
+    /// `image_too_large`.
+    fn new(calibration: RigCalibration, limits: Limits) -> Result<Self, Refusal> {
+        check_size(&calibration, limits)?;
+        let sides = calibration.sides.as_ref();
+        Ok(Self {
+            middle: Rectifier::new(&calibration.middle),
+            sides: [
+                sides.and_then(|sides| Rectifier::new(&sides.left.camera)),
+                sides.and_then(|sides| Rectifier::new(&sides.right.camera)),
+            ],
             calibration,
+        })
+    }
+}
+
+/// # Errors
+/// `image_too_large`.
+fn check_size(calibration: &RigCalibration, limits: Limits) -> Result<(), Refusal> {
+    let sides = calibration.sides.iter();
+    let sides = sides.flat_map(|sides| [&sides.left.camera, &sides.right.camera]);
+    for camera in sides.chain([&calibration.middle]) {
+        let pixels = camera.intrinsics.pixels();
+        if pixels > limits.image_pixels_max {
+            return Err(Refusal::new(
+                "image_too_large",
+                format!(
+                    "the calibration is of {pixels} pixels, more than image_pixels_max = {}: send smaller pictures, or raise the setting",
+                    limits.image_pixels_max
+                ),
+            ));
         }
     }
+    Ok(())
 }
 
 /// A frame whose pose or calibration may still come.
@@ -115,6 +153,7 @@ impl Camera {
             track: PoseTrack::default(),
             waiting: None,
             calibration: None,
+            markers: VecDeque::new(),
             calibration_asked: None,
             order: StampOrder::default(),
             last_received: None,
@@ -125,29 +164,69 @@ impl Camera {
         }
     }
 
+    /// # Errors
+    /// `image_too_large`.
     pub fn set_calibration(
         &mut self,
-        calibration: Calibration,
+        calibration: RigCalibration,
         limits: Limits,
     ) -> Result<(), Refusal> {
-        let pixels = calibration.intrinsics.pixels();
-        if pixels > limits.image_pixels_max {
-            return Err(Refusal::new(
-                "image_too_large",
-                format!(
-                    "the calibration is of {pixels} pixels, more than image_pixels_max = {}: send smaller pictures, or raise the setting",
-                    limits.image_pixels_max
-                ),
-            ));
-        }
-        if self
-            .calibration
-            .as_ref()
-            .is_none_or(|lens| lens.calibration != calibration)
-        {
-            self.calibration = Some(Lens::new(calibration));
-        }
+        self.calibration = Some(self.lenses(Some(&calibration), limits)?);
         Ok(())
+    }
+
+    /// Of the calibration that a frame brings, or else of the one that is known.
+    ///
+    /// # Errors
+    /// `image_too_large`, `no_calibration`.
+    pub fn lenses(
+        &self,
+        brought: Option<&RigCalibration>,
+        limits: Limits,
+    ) -> Result<Arc<Lenses>, Refusal> {
+        match (&self.calibration, brought) {
+            (Some(known), None) => Ok(known.clone()),
+            (Some(known), Some(brought)) if known.calibration == *brought => Ok(known.clone()),
+            (_, Some(brought)) => Ok(Arc::new(Lenses::new(brought.clone(), limits)?)),
+            (None, None) => Err(no_calibration()),
+        }
+    }
+
+    /// The calibration that the waiting frame brings, or else the one that is known.
+    fn calibration_at_hand(&self) -> Option<&RigCalibration> {
+        let brought = self.waiting.as_ref();
+        brought
+            .and_then(|waiting| waiting.frame.calibration.as_ref())
+            .or_else(|| Some(&self.calibration.as_ref()?.calibration))
+    }
+
+    /// Takes a sample of the `markers` key; [`Self::fit_markers`] makes a pose of it.
+    pub fn put_markers(&mut self, stamp_ns: i64, marker_in_world: Markers) {
+        if self.markers.len() == POSES_MAX {
+            self.markers.pop_front();
+        }
+        self.markers.push_back((stamp_ns, marker_in_world));
+    }
+
+    /// Fits the plate to the markers that came, as soon as it is known, and returns why some gave no pose.
+    pub fn fit_markers(&mut self) -> Vec<Refused> {
+        if self.markers.is_empty() {
+            return Vec::new();
+        }
+        let Some(calibration) = self.calibration_at_hand().cloned() else {
+            return Vec::new();
+        };
+        let samples = std::mem::take(&mut self.markers);
+        let fits = samples.into_iter().filter_map(|(stamp_ns, markers)| {
+            let fit = fitted(&calibration, &markers)
+                .and_then(|world_from_camera| self.track.push(stamp_ns, world_from_camera));
+            fit.err().map(|refusal| Refused {
+                refusal,
+                stamp_ns,
+                sequence: 0,
+            })
+        });
+        fits.collect()
     }
 
     /// Reads a frame that came and lets it wait for what it lacks. `replaced`: frames it replaced in its slot.
@@ -189,8 +268,7 @@ impl Camera {
             return Err(refused(goes_back("frame", stamp_ns, last_ns)));
         }
         if let Some(calibration) = &frame.calibration {
-            self.set_calibration(calibration.clone(), limits)
-                .map_err(refused)?;
+            check_size(calibration, limits).map_err(refused)?;
         }
         self.waiting = Some(Waiting {
             frame,
@@ -214,49 +292,50 @@ impl Camera {
                 sequence: frame.sequence,
             })
         };
-        let turn = if self.calibration.is_none() {
-            if self
-                .calibration_asked
-                .is_none_or(|asked| now.saturating_duration_since(asked) >= CALIBRATION_WAIT)
-            {
-                self.calibration_asked = Some(now);
-                ask_calibration(&self.path);
-            }
-            let deadline = *arrived + CALIBRATION_WAIT;
-            if now < deadline {
-                return Some(Turn::Until(deadline));
-            }
-            refuse(Refusal::new(
-                "no_calibration",
-                "no calibration is known: put it on the camera's `calibration` key, answer gets there, or send it in the frame",
-            ))
-        } else {
-            let pose = match frame.world_from_camera {
-                Some(pose) => TrackedPose::At(pose),
-                None => self.track.at(frame.stamp_ns),
-            };
-            match pose {
-                TrackedPose::At(pose) => {
-                    let frame = self.waiting.take()?.frame;
-                    return Some(Turn::Ready(pose, frame));
+        let turn = match self.calibration_at_hand() {
+            None => {
+                if self
+                    .calibration_asked
+                    .is_none_or(|asked| now.saturating_duration_since(asked) >= CALIBRATION_WAIT)
+                {
+                    ask_calibration(&self.path);
+                    self.calibration_asked = Some(now);
                 }
-                TrackedPose::Never(refusal) => refuse(refusal),
-                TrackedPose::Later => {
-                    let deadline = *arrived + pose_wait;
-                    if now < deadline {
-                        return Some(Turn::Until(deadline));
+                let deadline = *arrived + CALIBRATION_WAIT;
+                if now < deadline {
+                    return Some(Turn::Until(deadline));
+                }
+                refuse(no_calibration())
+            }
+            Some(calibration) => {
+                let pose = match carried_pose(frame, calibration) {
+                    Some(Ok(pose)) => TrackedPose::At(pose),
+                    Some(Err(refusal)) => TrackedPose::Never(refusal),
+                    None => self.track.at(frame.stamp_ns),
+                };
+                match pose {
+                    TrackedPose::At(pose) => {
+                        let frame = self.waiting.take()?.frame;
+                        return Some(Turn::Ready(pose, frame));
                     }
-                    refuse(Refusal::new(
-                        "no_pose",
-                        if self.track.is_empty() {
-                            "the frame carries no pose and none came on the `pose` key: send `world_from_camera` in the frame, or PoseSamples".to_owned()
-                        } else {
-                            format!(
-                                "no pose sample at or after the frame's stamp came within pose_wait_s = {} s: publish poses more often, or raise the setting",
-                                pose_wait.as_secs_f64()
-                            )
-                        },
-                    ))
+                    TrackedPose::Never(refusal) => refuse(refusal),
+                    TrackedPose::Later => {
+                        let deadline = *arrived + pose_wait;
+                        if now < deadline {
+                            return Some(Turn::Until(deadline));
+                        }
+                        refuse(Refusal::new(
+                            "no_pose",
+                            if self.track.is_empty() {
+                                "the frame carries neither a pose nor markers and none came on the `pose` and `markers` keys: send `world_from_camera` or `markers` in the frame, or PoseSamples or Markers".to_owned()
+                            } else {
+                                format!(
+                                    "no pose or marker sample at or after the frame's stamp came within pose_wait_s = {} s: publish them more often, or raise the setting",
+                                    pose_wait.as_secs_f64()
+                                )
+                            },
+                        ))
+                    }
                 }
             }
         };
@@ -264,32 +343,15 @@ impl Camera {
         Some(turn)
     }
 
-    /// Unpacks and rectifies a frame's pictures.
-    ///
-    /// # Errors
-    /// Pictures that cannot be unpacked or are not of the calibration's size.
-    pub fn unpack(
-        &self,
-        packed: &PackedFrame,
-        world_from_camera: Pose,
-        noise_default: PoseNoise,
-        limits: Limits,
-    ) -> Result<Frame, Refusal> {
-        let Some(lens) = &self.calibration else {
-            return Err(Refusal::new("no_calibration", "no calibration is known"));
-        };
-        unpack(
-            packed,
-            lens,
-            self.path.source.clone(),
-            world_from_camera,
-            noise_default,
-            limits,
-        )
-    }
-
-    /// Counts a frame that was processed and goes on from its stamp.
-    pub fn processed(&mut self, image: RgbImage, report: proto::SurpriseReport, stamp_ns: i64) {
+    /// Counts a frame that was processed and goes on from its stamp, and with its calibration.
+    pub fn processed(
+        &mut self,
+        image: RgbImage,
+        lenses: Arc<Lenses>,
+        report: proto::SurpriseReport,
+        stamp_ns: i64,
+    ) {
+        self.calibration = Some(lenses);
         self.order.accept(stamp_ns);
         self.last_image = Some(Arc::new(image));
         self.snapshot = None;
@@ -350,37 +412,78 @@ pub fn busy() -> Refusal {
     )
 }
 
-/// A frame that brings everything itself, as an evaluation asks for.
-///
-/// # Errors
-/// What is wrong with it, or missing.
-pub fn unpack_alone(
-    packed: &PackedFrame,
-    source: Source,
-    noise_default: PoseNoise,
-    limits: Limits,
-) -> Result<Frame, Refusal> {
-    let (Some(calibration), Some(pose)) = (&packed.calibration, packed.world_from_camera) else {
-        return Err(Refusal::new(
-            "no_calibration",
-            "a frame to evaluate must carry its pose, and its calibration or the parameters robot and camera",
-        ));
-    };
-    let lens = Lens::new(calibration.clone());
-    unpack(packed, &lens, source, pose, noise_default, limits)
+fn no_calibration() -> Refusal {
+    Refusal::new(
+        "no_calibration",
+        "no calibration is known: put it on the camera's `calibration` key, answer gets there, or send it in the frame",
+    )
 }
 
-fn unpack(
+/// The calibration of a frame that brings everything itself, as an evaluation asks for.
+///
+/// # Errors
+/// `image_too_large`, `no_calibration`.
+pub fn lenses_alone(packed: &PackedFrame, limits: Limits) -> Result<Arc<Lenses>, Refusal> {
+    let Some(calibration) = &packed.calibration else {
+        return Err(Refusal::new(
+            "no_calibration",
+            "a frame to evaluate must carry its calibration, or come with the parameters robot and camera",
+        ));
+    };
+    Ok(Arc::new(Lenses::new(calibration.clone(), limits)?))
+}
+
+/// # Errors
+/// `no_pose`, or why its markers give none.
+pub fn pose_alone(packed: &PackedFrame, lenses: &Lenses) -> Result<Pose, Refusal> {
+    carried_pose(packed, &lenses.calibration).unwrap_or_else(|| {
+        Err(Refusal::new(
+            "no_pose",
+            "a frame to evaluate must carry its pose in `world_from_camera`, or `markers`",
+        ))
+    })
+}
+
+/// The frame's own pose, or else the one that its markers give; `None` where it carries neither.
+fn carried_pose(
     packed: &PackedFrame,
-    lens: &Lens,
+    calibration: &RigCalibration,
+) -> Option<Result<Pose, Refusal>> {
+    if let Some(pose) = packed.world_from_camera {
+        return Some(Ok(pose));
+    }
+    Some(fitted(calibration, packed.marker_in_world.as_ref()?))
+}
+
+fn fitted(
+    calibration: &RigCalibration,
+    marker_in_world: &[Option<Point3<f64>>],
+) -> Result<Pose, Refusal> {
+    let plate = calibration.plate.as_ref().ok_or_else(|| {
+        Refusal::new(
+            "no_plate",
+            "markers came but the calibration has no plate: fill its `marker_in_plate` and `camera_from_plate`",
+        )
+    })?;
+    Ok(localise::world_from_camera(plate, marker_in_world)?)
+}
+
+/// Unpacks and rectifies a frame's pictures.
+///
+/// # Errors
+/// Pictures that cannot be unpacked or are not of the calibration's size; `side_calibration` where depth is to be
+/// computed by cameras that the calibration lacks.
+pub fn unpack(
+    packed: &PackedFrame,
+    lenses: &Lenses,
     source: Source,
     world_from_camera: Pose,
     noise_default: PoseNoise,
     limits: Limits,
 ) -> Result<Frame, Refusal> {
     let pictures = packed.pictures(limits)?;
-    let intrinsics = lens.calibration.intrinsics;
-    let (mut image, mut depth_m) = (pictures.image, pictures.depth_m);
+    let intrinsics = lenses.calibration.middle.intrinsics;
+    let mut image = pictures.image;
     if (image.width, image.height) != (intrinsics.width, intrinsics.height) {
         return Err(FrameError::ImageSize {
             image_width: image.width,
@@ -390,22 +493,67 @@ fn unpack(
         }
         .into());
     }
-    if let Some(rectifier) = &lens.rectifier {
+    if let Some(rectifier) = &lenses.middle {
         image = rectifier.image(&image);
-        depth_m = rectifier.depth_m(&depth_m);
     }
+    let depth = match pictures.depth {
+        PicturedDepth::Given(depth_m) => DepthSource::Given(match &lenses.middle {
+            Some(rectifier) => rectifier.depth_m(&depth_m),
+            None => depth_m,
+        }),
+        PicturedDepth::Sides { left, right } => {
+            let calibration = lenses.calibration.sides.as_ref().ok_or_else(|| {
+                Refusal::new(
+                    "side_calibration",
+                    "left and right images came but the calibration lacks their cameras: fill its `left`, `right`, `middle_from_left` and `middle_from_right`",
+                )
+            })?;
+            let [left_rectifier, right_rectifier] = &lenses.sides;
+            DepthSource::Sides(Box::new(Sides {
+                left: side("left", left, &calibration.left, left_rectifier.as_ref())?,
+                right: side("right", right, &calibration.right, right_rectifier.as_ref())?,
+            }))
+        }
+    };
     let given = |value: f64, default: f64| if value > 0.0 { value } else { default };
     Ok(Frame {
         source,
         stamp_ns: packed.stamp_ns,
         sequence: packed.sequence,
         image,
-        depth_m,
+        depth,
         intrinsics,
         world_from_camera,
         pose_noise: packed.pose_noise.map(|noise| PoseNoise {
             position_m: given(noise.position_m, noise_default.position_m),
             rotation_rad: given(noise.rotation_rad, noise_default.rotation_rad),
         }),
+    })
+}
+
+fn side(
+    name: &'static str,
+    image: GreyImage,
+    calibration: &SideCalibration,
+    rectifier: Option<&Rectifier>,
+) -> Result<SideView, Refusal> {
+    let intrinsics = calibration.camera.intrinsics;
+    if (image.width, image.height) != (intrinsics.width, intrinsics.height) {
+        return Err(FrameError::SideSize {
+            side: name,
+            got_width: image.width,
+            got_height: image.height,
+            width: intrinsics.width,
+            height: intrinsics.height,
+        }
+        .into());
+    }
+    Ok(SideView {
+        image: match rectifier {
+            Some(rectifier) => rectifier.grey(&image),
+            None => image,
+        },
+        intrinsics,
+        middle_from_side: calibration.middle_from_side,
     })
 }

@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | frames | one a camera | the newest wins, the replaced is counted |
 //! | calibrations | one a camera | the newest wins |
-//! | poses | [`POSES_MAX`] a camera | the oldest is dropped and counted |
+//! | poses and markers | [`POSES_MAX`] a camera | the oldest is dropped and counted |
 //! | refusals | [`REFUSALS_MAX`] a camera | the newest is only counted |
 //! | asks | [`ASKS_MAX`] | refused as busy and counted |
 //! | cameras | [`CAMERAS_MAX`] | the one unheard for a minute makes room, or the new one is refused |
@@ -45,6 +45,8 @@ pub struct Arrival {
 #[derive(Debug)]
 pub enum Aside {
     Pose(ZBytes),
+    /// The plate's markers, from which a pose follows.
+    Markers(ZBytes),
     Calibration(ZBytes),
     /// Not even worth decoding; the key's leaf on which it came.
     Refused(&'static str, Refusal),
@@ -64,7 +66,8 @@ pub struct SlotCounters {
 struct Slot {
     frame: Option<Arrival>,
     replaced_since_taken: u64,
-    poses: VecDeque<ZBytes>,
+    /// Poses and markers, in the order they came.
+    poses: VecDeque<Aside>,
     calibration: Option<ZBytes>,
     refused: VecDeque<(&'static str, Refusal)>,
     live: bool,
@@ -150,12 +153,12 @@ impl Inbox {
     /// `too_many_cameras`.
     pub fn put_aside(&self, source: &Source, aside: Aside) -> Result<(), Refusal> {
         self.with_slot(source, |slot| match aside {
-            Aside::Pose(payload) => {
+            Aside::Pose(_) | Aside::Markers(_) => {
                 if slot.poses.len() == POSES_MAX {
                     slot.poses.pop_front();
                     slot.counters.poses_dropped += 1;
                 }
-                slot.poses.push_back(payload);
+                slot.poses.push_back(aside);
             }
             Aside::Calibration(payload) => slot.calibration = Some(payload),
             Aside::Refused(leaf, refusal) => {
@@ -299,7 +302,7 @@ impl State {
         };
         for (source, slot) in &mut self.cameras {
             let calibration = slot.calibration.take().map(Aside::Calibration);
-            let poses = slot.poses.drain(..).map(Aside::Pose);
+            let poses = slot.poses.drain(..);
             let refused = slot
                 .refused
                 .drain(..)

@@ -117,6 +117,7 @@ impl Door {
             Err(refusal) => Message::Aside(Aside::Refused(leaf, refusal)),
             Ok(payload) => match leaf {
                 keys::POSE => Message::Aside(Aside::Pose(payload)),
+                keys::MARKERS => Message::Aside(Aside::Markers(payload)),
                 keys::CALIBRATION => Message::Aside(Aside::Calibration(payload)),
                 _ => Message::Frame(Arrival {
                     payload,
@@ -155,6 +156,7 @@ fn put(inbox: &Inbox, source: &Source, message: Message) -> Result<(), Refusal> 
 fn expected_encoding(leaf: &str) -> Encoding {
     match leaf {
         keys::POSE => keys::encoding::<proto::PoseSample>(),
+        keys::MARKERS => keys::encoding::<proto::Markers>(),
         keys::CALIBRATION => keys::encoding::<proto::Calibration>(),
         _ => keys::encoding::<proto::Frame>(),
     }
@@ -196,7 +198,7 @@ pub fn start(places: &Arc<Places>, starts: Starts) -> zenoh::Result<Ingest> {
     };
     let session = &places.session;
     let mut subscribers = Vec::new();
-    for leaf in [keys::CALIBRATION, keys::POSE, keys::FRAME] {
+    for leaf in [keys::CALIBRATION, keys::POSE, keys::MARKERS, keys::FRAME] {
         let door = door.clone();
         subscribers.push(
             session

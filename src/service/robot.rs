@@ -15,7 +15,11 @@ use zenoh::{
 use super::session::ZenohOptions;
 use crate::{
     config::ConfigError,
-    model::{camera::Calibration, frame::Frame, refusal::Refusal},
+    model::{
+        camera::{Calibration, RigCalibration},
+        frame::{Frame, RigFrame},
+        refusal::Refusal,
+    },
     wire::{
         decode, encode,
         keys::{self, CameraPath},
@@ -160,6 +164,29 @@ impl Robot {
             intrinsics: frame.intrinsics,
             distortion: None,
         }));
+        self.put(message, file).await
+    }
+
+    /// A frame of a rig, with its calibration. The image goes as `file` if there is one, the side images as grey ones.
+    ///
+    /// # Errors
+    /// A closed session.
+    pub async fn publish_rig(
+        &self,
+        frame: &RigFrame,
+        calibration: &RigCalibration,
+        file: Option<PictureFile>,
+    ) -> Result<(), RobotError> {
+        let mut message = encode::rig_frame(frame);
+        message.calibration = Some(encode::rig_calibration(calibration));
+        self.put(message, file).await
+    }
+
+    async fn put(
+        &self,
+        mut message: proto::Frame,
+        file: Option<PictureFile>,
+    ) -> Result<(), RobotError> {
         if let Some(PictureFile { encoding, bytes }) = file {
             message.image = Some(proto::Image {
                 encoding: encoding.to_owned(),

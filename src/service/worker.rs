@@ -11,14 +11,14 @@ use tokio::sync::watch;
 
 use super::{
     ask::{Ask, Snapshot},
-    camera::{Camera, Refused, Turn, unpack_alone},
+    camera::{Camera, Refused, Turn, lenses_alone, pose_alone, unpack},
     inbox::{Aside, Inbox},
     publish::CameraPublisher,
     status::PlaceStatus,
 };
 use crate::{
     model::{
-        frame::{Frame, RgbImage, Source},
+        frame::{RgbImage, Source},
         pose::{Pose, PoseNoise},
         refusal::Refusal,
     },
@@ -97,6 +97,7 @@ impl Worker {
             for source in delivery.frames {
                 desk.receive(&source);
             }
+            desk.fit_markers();
             let next = desk.turn();
             wake = next.wake;
             desk.publish_status();
@@ -150,6 +151,11 @@ impl Desk {
                 decode::pose_sample(&payload.to_bytes())
                     .and_then(|(stamp_ns, pose)| camera.track.push(stamp_ns, pose)),
             ),
+            Aside::Markers(payload) => (
+                keys::MARKERS,
+                decode::markers_sample(&payload.to_bytes())
+                    .map(|(stamp_ns, markers)| camera.put_markers(stamp_ns, markers)),
+            ),
             Aside::Calibration(payload) => (
                 keys::CALIBRATION,
                 decode::message::<proto::Calibration>(&payload.to_bytes())
@@ -181,6 +187,21 @@ impl Desk {
         };
         if let Err(refused) = camera.receive(arrival, replaced, limits) {
             self.refuse(source, keys::FRAME, refused);
+        }
+    }
+
+    /// Makes poses of the markers whose plate is known by now.
+    fn fit_markers(&mut self) {
+        let refused: Vec<(Source, Refused)> = self
+            .cameras
+            .iter_mut()
+            .flat_map(|(source, camera)| {
+                let refused = camera.fit_markers();
+                refused.into_iter().map(|refused| (source.clone(), refused))
+            })
+            .collect();
+        for (source, refused) in refused {
+            self.refuse(&source, keys::MARKERS, refused);
         }
     }
 
@@ -241,7 +262,8 @@ impl Desk {
         let Some(camera) = self.cameras.get_mut(source) else {
             return Ok(());
         };
-        let frame = camera.unpack(packed, pose, noise, limits)?;
+        let lenses = camera.lenses(packed.calibration.as_ref(), limits)?;
+        let frame = unpack(packed, &lenses, source.clone(), pose, noise, limits)?;
         let pipeline = &mut self.worker.pipeline;
         let report = pipeline.process(&frame)?;
         let processing_seconds = started.elapsed().as_secs_f64();
@@ -249,7 +271,7 @@ impl Desk {
         let message = encode::report(&report, &self.worker.place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
-        camera.processed(frame.image, message, frame.stamp_ns);
+        camera.processed(frame.image, lenses, message, frame.stamp_ns);
         if camera.watched(Instant::now()) {
             camera.show(|image| snapshot(pipeline, image));
         }
@@ -335,23 +357,23 @@ impl Desk {
         let started = Instant::now();
         let packed = decode::frame(frame)?;
         let known = camera.as_ref().and_then(|source| self.cameras.get(source));
-        let frame: Frame = match (known, packed.world_from_camera) {
-            (Some(known), Some(pose)) if packed.calibration.is_none() => {
-                known.unpack(&packed, pose, self.noise_default, self.limits)?
-            }
-            _ => {
-                let nobody = Source {
-                    robot: "".into(),
-                    camera: "".into(),
-                };
-                unpack_alone(
-                    &packed,
-                    camera.unwrap_or(nobody),
-                    self.noise_default,
-                    self.limits,
-                )?
-            }
+        let lenses = match known {
+            Some(known) => known.lenses(packed.calibration.as_ref(), self.limits)?,
+            None => lenses_alone(&packed, self.limits)?,
         };
+        let pose = pose_alone(&packed, &lenses)?;
+        let source = camera.unwrap_or_else(|| Source {
+            robot: "".into(),
+            camera: "".into(),
+        });
+        let frame = unpack(
+            &packed,
+            &lenses,
+            source,
+            pose,
+            self.noise_default,
+            self.limits,
+        )?;
         // The maps are of the evaluated frame from here on.
         self.maps_of = None;
         let report = self.worker.pipeline.evaluate(&frame)?;

@@ -3,7 +3,10 @@
 use nalgebra::{Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 
 use super::random::wander;
-use crate::model::{camera::Intrinsics, pose::Pose};
+use crate::model::{
+    camera::{Calibration, Intrinsics, Plate, RigCalibration, SideCalibration, SideCalibrations},
+    pose::Pose,
+};
 
 /// Three cameras in a row and the marker plate above them; everything that a calibration tells.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,6 +52,31 @@ impl Default for Rig {
                     std::f64::consts::FRAC_PI_2,
                 )),
             ),
+        }
+    }
+}
+
+impl Rig {
+    /// As the robot sends it.
+    pub fn calibration(&self) -> RigCalibration {
+        let camera = Calibration {
+            intrinsics: self.intrinsics,
+            distortion: None,
+        };
+        let side = |middle_from_side: Pose| SideCalibration {
+            camera: camera.clone(),
+            middle_from_side,
+        };
+        RigCalibration {
+            sides: Some(SideCalibrations {
+                left: side(self.middle_from_left),
+                right: side(self.middle_from_right),
+            }),
+            plate: Some(Plate {
+                marker_in_plate: self.marker_in_plate.clone(),
+                camera_from_plate: self.camera_from_plate,
+            }),
+            middle: camera,
         }
     }
 }

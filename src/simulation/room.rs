@@ -12,6 +12,17 @@ use super::{
 
 pub const TABLE_HEIGHT_M: f64 = 0.75;
 const TABLE_SIZE_M: [f64; 2] = [1.45, 0.92];
+/// Far below the thickness of anything that stands on the table.
+const ON_CLOTH_M: f64 = 1e-3;
+
+/// Whether a point of the world that the room itself shows lies on the tablecloth's upper side.
+pub fn is_on_cloth(point: &Point3<f64>) -> bool {
+    let [width, depth] = TABLE_SIZE_M;
+    (point.z - TABLE_HEIGHT_M).abs() < ON_CLOTH_M
+        && point.x.abs() < 0.5 * width
+        && point.y.abs() < 0.5 * depth
+}
+
 const FLOOR_M: f64 = 7.0;
 
 /// A point on the table.

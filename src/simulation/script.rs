@@ -16,7 +16,11 @@ use super::{
     tracker::{Marker, TRACKER_HZ, Tracker},
 };
 use crate::{
-    model::{camera::Intrinsics, frame::RgbImage, pose::Pose},
+    model::{
+        camera::Intrinsics,
+        frame::{RgbImage, RigFrame},
+        pose::Pose,
+    },
     stages::localise::{LocaliseError, PlateFit, TOLERANCE_M, fit_plate},
 };
 
@@ -117,6 +121,19 @@ impl Capture {
         } else {
             "back"
         }
+    }
+
+    /// What the robot sends; `None` with [`Views::Middle`].
+    pub fn rig_frame(&self) -> Option<RigFrame> {
+        let (left, right) = self.sides.as_ref()?;
+        Some(RigFrame {
+            stamp_ns: self.stamp_ns,
+            sequence: self.sequence,
+            image: self.middle.image.clone(),
+            left: left.image.grey(),
+            right: right.image.grey(),
+            marker_in_world: self.markers.iter().map(Marker::tracked).collect(),
+        })
     }
 }
 

@@ -29,50 +29,61 @@ pub struct BlockMap {
 
 impl BlockMap {
     /// Means over 4x4 pixels of a map of the given width.
-    pub fn means(map: &[f32], width: usize) -> Self {
+    fn average(&mut self, map: &[f32], width: usize) {
         let blocks = width / BLOCK;
-        let mut means = Self {
-            width: blocks,
-            height: map.len() / width / BLOCK,
-            data: Vec::new(),
-        };
-        means.data.reserve(means.width * means.height);
+        self.width = blocks;
+        self.height = map.len() / width / BLOCK;
+        self.data.clear();
         for rows in map.chunks_exact(width * BLOCK) {
-            means.data.extend((0..blocks).map(|block| {
+            self.data.extend((0..blocks).map(|block| {
                 let sum: f32 = (0..BLOCK)
                     .flat_map(|y| &rows[y * width + block * BLOCK..][..BLOCK])
                     .sum();
                 sum / (BLOCK * BLOCK) as f32
             }));
         }
-        means
     }
 
-    /// The median over 3x3 blocks; beyond the border the nearest block stands in.
-    pub fn median(&self) -> Self {
-        let mut data = Vec::with_capacity(self.data.len());
-        let clamped =
-            |at: usize, step: usize, end: usize| (at + step).saturating_sub(1).min(end - 1);
-        for y in 0..self.height {
-            for x in 0..self.width {
-                let mut around: [f32; 9] = std::array::from_fn(|index| {
-                    let y = clamped(y, index / 3, self.height);
-                    let x = clamped(x, index % 3, self.width);
-                    self.data[y * self.width + x]
-                });
-                around.select_nth_unstable_by(4, f32::total_cmp);
-                data.push(around[4]);
+    /// The median over 3x3 blocks of another map; beyond the border the nearest block stands in.
+    fn median(&mut self, of: &Self) {
+        (self.width, self.height) = (of.width, of.height);
+        self.data.resize(of.data.len(), 0.0);
+        let (width, height) = (of.width, of.height);
+        for (y, medians) in self.data.chunks_exact_mut(width.max(1)).enumerate() {
+            let row = |y: usize| &of.data[y * width..][..width];
+            let rows = [
+                row(y.saturating_sub(1)),
+                row(y),
+                row((y + 1).min(height - 1)),
+            ];
+            for (x, median) in medians.iter_mut().enumerate() {
+                let columns = [x.saturating_sub(1), x, (x + 1).min(width - 1)];
+                let sorted = columns.map(|x| sort3([rows[0][x], rows[1][x], rows[2][x]]));
+                // The middle of the least's greatest, the middles' middle and the greatest's least.
+                let [a, b, c] = sorted;
+                let low = a[0].max(b[0]).max(c[0]);
+                let middle = sort3([a[1], b[1], c[1]])[1];
+                let high = a[2].min(b[2]).min(c[2]);
+                *median = sort3([low, middle, high])[1];
             }
         }
-        Self { data, ..*self }
     }
 
     /// The map that seeds regions.
     pub fn evidence(map: &[f32], width: usize, evidence: Evidence) -> Self {
-        let means = Self::means(map, width);
+        let mut blocks = Self::default();
+        blocks.find(map, width, evidence, &mut Self::default());
+        blocks
+    }
+
+    /// The same; `means` is working memory.
+    pub fn find(&mut self, map: &[f32], width: usize, evidence: Evidence, means: &mut Self) {
         match evidence {
-            Evidence::Blocks => means,
-            Evidence::BlockMedian => means.median(),
+            Evidence::Blocks => self.average(map, width),
+            Evidence::BlockMedian => {
+                means.average(map, width);
+                self.median(means);
+            }
         }
     }
 
@@ -85,6 +96,12 @@ impl BlockMap {
             (first..end_column).map(move |x| (x, y, self.data[y * self.width + x]))
         })
     }
+}
+
+fn sort3([a, b, c]: [f32; 3]) -> [f32; 3] {
+    let (a, b) = (a.min(b), a.max(b));
+    let (b, c) = (b.min(c), b.max(c));
+    [a.min(b), a.max(b), c]
 }
 
 /// What a region's place in the world is computed from.

@@ -3,6 +3,11 @@
 //! Expected and observed luminance -> the factor by which the observation is brighter: the median of Y / tau_Y where
 //! both can be trusted. The paper has none; auto exposure makes everything surprising without it.
 
+use crate::{
+    isa::{Isa, for_each_isa},
+    lanes::LANES,
+};
+
 /// Pixels darker than this in expectation carry too little for a ratio, grey levels.
 const EXPECTED_MIN: f32 = 20.0;
 /// Observed luminance that is neither noise nor saturated, grey levels.
@@ -16,29 +21,29 @@ const BINS: usize = 2048;
 
 /// `rows` yields (expected luminance, coverage, observed luminance), a row each. 1 where nothing can be compared.
 pub fn exposure_gain<'a>(rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [f32])>) -> f32 {
-    // A histogram in place of sorting: clipping the ratios first does not move a median inside the bounds.
-    let mut histogram = [0u32; BINS];
-    let mut count = 0u32;
-    let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
+    exposure_gain_on(Isa::Portable, rows)
+}
+
+/// The same bits with other instructions.
+pub fn exposure_gain_on<'a>(
+    isa: Isa,
+    rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [f32])>,
+) -> f32 {
+    // A histogram in place of sorting: clipping the ratios first does not move a median inside the bounds. The last
+    // bin is for what cannot be compared.
+    let mut histogram = [0u32; BINS + 1];
+    let mut pixels = 0;
     for (expected, coverage, observed) in rows {
-        for ((&expected, &coverage), &observed) in expected.iter().zip(coverage).zip(observed) {
-            let comparable = coverage > 0.0
-                && expected > EXPECTED_MIN
-                && observed > OBSERVED_MIN
-                && observed < OBSERVED_MAX;
-            if comparable {
-                let bin = (observed / expected - GAIN_MIN) * scale;
-                // The cast saturates below at 0.
-                histogram[(bin as usize).min(BINS - 1)] += 1;
-                count += 1;
-            }
-        }
+        count_row(isa, expected, coverage, observed, &mut histogram);
+        pixels += expected.len() as u32;
     }
+    let count = pixels - histogram[BINS];
+    let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
     if count == 0 {
         return 1.0;
     }
     let mut below = 0;
-    for (bin, &members) in histogram.iter().enumerate() {
+    for (bin, &members) in histogram[..BINS].iter().enumerate() {
         if 2 * (below + members) >= count {
             // Where in the bin the median lies, as if its members were spread evenly.
             let inside = (count as f32 / 2.0 - below as f32) / members as f32;
@@ -47,4 +52,43 @@ pub fn exposure_gain<'a>(rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [
         below += members;
     }
     GAIN_MAX
+}
+
+for_each_isa! {
+    fn count_row(
+        expected: &[f32],
+        coverage: &[f32],
+        observed: &[f32],
+        histogram: &mut [u32; BINS + 1],
+    ) = count_kernel;
+}
+
+#[inline(always)]
+fn count_kernel(
+    expected: &[f32],
+    coverage: &[f32],
+    observed: &[f32],
+    histogram: &mut [u32; BINS + 1],
+) {
+    let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
+    let mut bins = [0u32; LANES];
+    for start in (0..expected.len()).step_by(LANES) {
+        let end = expected.len().min(start + LANES);
+        let (expected, coverage) = (&expected[start..end], &coverage[start..end]);
+        let observed = &observed[start..end];
+        for lane in 0..end - start {
+            let (tau, y) = (expected[lane], observed[lane]);
+            let comparable = (coverage[lane] > 0.0)
+                & (tau > EXPECTED_MIN)
+                & (y > OBSERVED_MIN)
+                & (y < OBSERVED_MAX);
+            let bin = (y / tau - GAIN_MIN) * scale;
+            // The cast saturates below at 0.
+            let bin = (bin as u32).min(BINS as u32 - 1);
+            bins[lane] = if comparable { bin } else { BINS as u32 };
+        }
+        for &bin in &bins[..end - start] {
+            histogram[bin as usize] += 1;
+        }
+    }
 }

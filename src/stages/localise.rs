@@ -9,7 +9,7 @@
 
 use nalgebra::{Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 
-use crate::model::pose::Pose;
+use crate::model::{camera::Plate, pose::Pose, refusal::Refusal};
 
 /// Markers without which no rotation can be had.
 pub const MIN_MARKERS: usize = 3;
@@ -36,17 +36,21 @@ pub enum LocaliseError {
         "the plate has {expected} markers but {got} were given: send all, the unseen ones as not visible"
     )]
     Count { expected: usize, got: usize },
-    #[error("{visible} markers are tracked but the rotation needs {MIN_MARKERS}")]
+    #[error(
+        "{visible} markers are tracked, but at most one may be missing and the rotation needs {MIN_MARKERS}: is the plate hidden?"
+    )]
     TooFew { visible: usize },
-    #[error("the tracked markers lie on a line, which leaves the rotation about it open")]
+    #[error(
+        "the tracked markers lie on a line, which leaves the rotation about it open: mount one beside it"
+    )]
     Collinear,
     #[error(
         "the markers are a mirror image of the plate: are two of them exchanged, or an axis of the tracker turned round?"
     )]
     Mirrored,
-    #[error("the markers do not fit the plate: {:.1} mm RMS is the best of any choice", residual_m * 1e3)]
+    #[error("the markers do not fit the plate: {:.1} mm RMS is the best of any choice; does marker_in_plate count metres, in the markers' order?", residual_m * 1e3)]
     Inconsistent { residual_m: f64 },
-    #[error("a marker's position is not a finite number")]
+    #[error("a marker's position is not a finite number: send what is not seen as not visible")]
     NotFinite,
 }
 
@@ -62,6 +66,24 @@ impl LocaliseError {
             Self::NotFinite => "marker_not_finite",
         }
     }
+}
+
+impl From<LocaliseError> for Refusal {
+    fn from(error: LocaliseError) -> Self {
+        Self::new(error.code(), error.to_string())
+    }
+}
+
+/// `world_from_camera` of the camera that carries the plate, from its tracked markers (world, metres).
+///
+/// # Errors
+/// As [`fit_plate`], with [`TOLERANCE_M`].
+pub fn world_from_camera(
+    plate: &Plate,
+    marker_in_world: &[Option<Point3<f64>>],
+) -> Result<Pose, LocaliseError> {
+    let fit = fit_plate(&plate.marker_in_plate, marker_in_world, TOLERANCE_M)?;
+    Ok(fit.world_from_plate * plate.camera_from_plate.inverse())
 }
 
 /// Fits the plate to its tracked markers (same order, metres). One marker may be missing, or, if four or more are there,

@@ -22,6 +22,4 @@ pub mod update;
 
 pub mod surprise;
 
-pub mod lanes;
-
 pub mod attend;

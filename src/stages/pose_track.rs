@@ -13,6 +13,8 @@ use crate::model::{pose::Pose, refusal::Refusal};
 const SAMPLES_MAX: usize = 1024;
 /// Between samples farther apart the camera may have been anywhere.
 const GAP_MAX_NS: i64 = 1_000_000_000;
+/// Between rotations farther apart than this there is no telling which way the camera turned.
+const TURN_MAX_RAD: f64 = 170.0 * std::f64::consts::PI / 180.0;
 
 /// The latest poses of one camera.
 #[derive(Debug, Clone, Default)]
@@ -87,25 +89,27 @@ impl PoseTrack {
                 ),
             ));
         }
-        let share = (stamp_ns - before_ns) as f64 / gap_ns as f64;
-        let rotation = world_from_before
+        if world_from_before
             .rotation
-            // Opposite rotations have no shortest way between them.
-            .try_slerp(&world_from_after.rotation, share, 1e-9);
-        match rotation {
-            Some(rotation) => TrackedPose::At(Pose::from_parts(
-                world_from_before
-                    .translation
-                    .vector
-                    .lerp(&world_from_after.translation.vector, share)
-                    .into(),
-                rotation,
-            )),
-            None => TrackedPose::Never(Refusal::new(
+            .angle_to(&world_from_after.rotation)
+            > TURN_MAX_RAD
+        {
+            return TrackedPose::Never(Refusal::new(
                 "pose_gap",
                 "the camera turned by half a circle between two pose samples: publish poses more often",
-            )),
+            ));
         }
+        let share = (stamp_ns - before_ns) as f64 / gap_ns as f64;
+        TrackedPose::At(Pose::from_parts(
+            world_from_before
+                .translation
+                .vector
+                .lerp(&world_from_after.translation.vector, share)
+                .into(),
+            world_from_before
+                .rotation
+                .slerp(&world_from_after.rotation, share),
+        ))
     }
 }
 

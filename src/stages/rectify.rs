@@ -7,7 +7,7 @@
 
 use crate::model::{
     camera::{Calibration, Intrinsics, PlumbBob},
-    frame::RgbImage,
+    frame::{GreyImage, RgbImage},
 };
 
 /// Where each pixel of the rectified image lies in the distorted one. Made once for a calibration.
@@ -38,8 +38,26 @@ impl Rectifier {
     /// The image must have the calibration's size.
     pub fn image(&self, distorted: &RgbImage) -> RgbImage {
         self.check(distorted.width, distorted.height, distorted.data.len() / 3);
+        RgbImage {
+            width: self.width,
+            height: self.height,
+            data: self.bilinear::<3>(&distorted.data),
+        }
+    }
+
+    /// The image must have the calibration's size.
+    pub fn grey(&self, distorted: &GreyImage) -> GreyImage {
+        self.check(distorted.width, distorted.height, distorted.data.len());
+        GreyImage {
+            width: self.width,
+            height: self.height,
+            data: self.bilinear::<1>(&distorted.data),
+        }
+    }
+
+    fn bilinear<const CHANNELS: usize>(&self, distorted: &[u8]) -> Vec<u8> {
         let (x_max, y_max) = ((self.width - 1) as f32, (self.height - 1) as f32);
-        let mut data = Vec::with_capacity(distorted.data.len());
+        let mut data = Vec::with_capacity(distorted.len());
         for &(u, v) in &self.sources {
             // NaN, of coefficients beyond reason, clamps to the corner.
             let (u, v) = (u.max(0.0).min(x_max), v.max(0.0).min(y_max));
@@ -47,19 +65,15 @@ impl Rectifier {
             let (right, below) = ((x + 1).min(self.width - 1), (y + 1).min(self.height - 1));
             let (fx, fy) = (u - x as f32, v - y as f32);
             let at = |x: usize, y: usize, channel: usize| {
-                f32::from(distorted.data[3 * (y * self.width + x) + channel])
+                f32::from(distorted[CHANNELS * (y * self.width + x) + channel])
             };
-            for channel in 0..3 {
+            for channel in 0..CHANNELS {
                 let upper = at(x, y, channel) * (1.0 - fx) + at(right, y, channel) * fx;
                 let lower = at(x, below, channel) * (1.0 - fx) + at(right, below, channel) * fx;
                 data.push((upper * (1.0 - fy) + lower * fy).round() as u8);
             }
         }
-        RgbImage {
-            width: self.width,
-            height: self.height,
-            data,
-        }
+        data
     }
 
     /// Metres, 0 = none; as many as the calibration's size has pixels.
@@ -135,7 +149,7 @@ mod tests {
     #[test]
     fn a_dot_moves_to_where_a_pinhole_camera_draws_it() {
         let lens = PlumbBob {
-            k1: -0.2,
+            k1: -0.45,
             k2: 0.05,
             p1: 0.003,
             p2: -0.002,

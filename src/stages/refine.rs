@@ -8,13 +8,15 @@
 use nalgebra::{Isometry3, SMatrix, SVector, Translation3, UnitQuaternion, Vector3};
 
 use crate::{
+    isa::{Isa, for_each_isa},
+    lanes::LANES,
     model::{
         camera::Intrinsics,
         pose::{Pose, PoseNoise},
         viewpoint::Coarse,
     },
     stages::interpolate::project::{
-        ProjectScratch, Projector, Sample, sample_depth_m, sample_position,
+        ProjectScratch, Projector, Reach, Sample, draw, sample_depth_m, sample_position,
     },
 };
 
@@ -51,6 +53,7 @@ const PIXELS_MIN: usize = 200;
 /// Expected pose error, pixels of the full image, from which a third and a fourth level are needed to catch it.
 const THIRD_LEVEL_PX: f64 = 2.5;
 const FOURTH_LEVEL_PX: f64 = 4.0;
+const LEVELS_MAX: usize = 4;
 /// Views whose depth differs by more than this share from the middle one do not predict a pixel.
 const DEPTH_TOLERANCE: f32 = 0.03;
 
@@ -86,13 +89,48 @@ struct Level {
     observed: Vec<f32>,
 }
 
-/// A comparable pixel: everything about it that does not change while the pose does.
-struct Point {
-    in_camera: [f32; 3],
+/// The comparable pixels: everything about them that does not change while the pose does, a plane a value, padded to
+/// whole steps by points behind the camera.
+#[derive(Default)]
+struct Points {
+    count: usize,
+    in_camera: [Vec<f32>; 3],
     /// d tau / d (translation, rotation) of the template, without the gain.
-    jacobian: [f32; 6],
-    luminance: f32,
-    inverse_sd: f32,
+    jacobian: [Vec<f32>; 6],
+    luminance: Vec<f32>,
+    inverse_sd: Vec<f32>,
+}
+
+impl Points {
+    fn planes(&mut self) -> impl Iterator<Item = &mut Vec<f32>> {
+        self.in_camera
+            .iter_mut()
+            .chain(&mut self.jacobian)
+            .chain([&mut self.luminance, &mut self.inverse_sd])
+    }
+
+    fn clear(&mut self) {
+        self.count = 0;
+        self.planes().for_each(Vec::clear);
+    }
+
+    #[inline(always)]
+    fn push(&mut self, in_camera: [f32; 3], jacobian: [f32; 6], luminance: f32, inverse_sd: f32) {
+        let values = in_camera
+            .into_iter()
+            .chain(jacobian)
+            .chain([luminance, inverse_sd]);
+        for (plane, value) in self.planes().zip(values) {
+            plane.push(value);
+        }
+        self.count += 1;
+    }
+
+    fn pad(&mut self) {
+        let padded = self.count.next_multiple_of(LANES);
+        self.planes().for_each(|plane| plane.resize(padded, 0.0));
+        self.in_camera[2][self.count..].fill(-1.0);
+    }
 }
 
 /// What is estimated: the real camera is `given * camera_from_real`, and Y = gain * tau + offset.
@@ -104,16 +142,37 @@ struct Estimate {
 }
 
 /// Keeps its working memory between frames.
-#[derive(Default)]
 pub struct PoseRefiner {
     maps: Vec<Sample>,
     scratch: ProjectScratch,
+    reach: Reach,
     residuals: Vec<f32>,
     magnitudes: Vec<f32>,
-    points: Vec<Point>,
+    points: Points,
+    isa: Isa,
+    pyramid: Vec<(Intrinsics, Level)>,
+}
+
+impl Default for PoseRefiner {
+    fn default() -> Self {
+        Self::new(Isa::detect())
+    }
 }
 
 impl PoseRefiner {
+    pub fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            maps: Vec::new(),
+            scratch: ProjectScratch::default(),
+            reach: Reach::default(),
+            residuals: Vec::new(),
+            magnitudes: Vec::new(),
+            points: Points::default(),
+            pyramid: Vec::new(),
+        }
+    }
+
     /// `views` are nearest first with their weight in means; `observed` is the luminance of the full image. Returns the
     /// given pose where refinement does not help.
     pub fn refine(
@@ -129,18 +188,49 @@ impl PoseRefiner {
             position_m: noise.position_m.max(POSITION_SD_MIN_M),
             rotation_rad: noise.rotation_rad.max(ROTATION_SD_MIN_RAD),
         };
+        let mut pyramid = std::mem::take(&mut self.pyramid);
+        pyramid.resize_with(LEVELS_MAX, Default::default);
+        let refined = self.refine_levels(
+            &mut pyramid,
+            views,
+            observed,
+            intrinsics,
+            world_from_camera,
+            noise,
+        );
+        self.pyramid = pyramid;
+        refined.unwrap_or(unchanged)
+    }
+
+    /// `None` where refinement does not help.
+    fn refine_levels(
+        &mut self,
+        pyramid: &mut [(Intrinsics, Level)],
+        views: &[(&Coarse, &Pose, f32)],
+        observed: &[f32],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        noise: PoseNoise,
+    ) -> Option<Refined> {
         let half = intrinsics.half();
-        let mut finest = self.predict(views, &half, world_from_camera);
-        finest.observed = halved(observed, intrinsics.width, intrinsics.height);
-        let Some(levels) = level_count(&finest, intrinsics, noise) else {
-            return unchanged;
-        };
-        let mut pyramid = vec![(half, finest)];
-        while pyramid.len() < levels {
-            let (camera, level) = &pyramid[pyramid.len() - 1];
-            let coarser = (camera.half(), level.halved());
-            pyramid.push(coarser);
+        pyramid[0].0 = half;
+        let finest = &mut pyramid[0].1;
+        self.predict(views, &half, world_from_camera, finest);
+        halve(
+            self.isa,
+            observed,
+            intrinsics.width,
+            intrinsics.height,
+            &mut finest.observed,
+        );
+        let levels = self.level_count(finest, intrinsics, noise)?;
+        for coarser in 1..levels {
+            let (finer, rest) = pyramid.split_at_mut(coarser);
+            let (camera, level) = &finer[coarser - 1];
+            rest[0].0 = camera.half();
+            halve_level(self.isa, level, &mut rest[0].1);
         }
+        let pyramid = &pyramid[..levels];
 
         let start = Estimate {
             given_from_real: Isometry3::identity(),
@@ -150,8 +240,8 @@ impl PoseRefiner {
         let mut estimate = start;
         let mut improved = false;
         for (index, (camera, level)) in pyramid.iter().enumerate().rev() {
-            collect_points(level, camera, &mut self.points);
-            if self.points.len() < PIXELS_MIN {
+            collect_points(self.isa, level, camera, &mut self.points);
+            if self.points.count < PIXELS_MIN {
                 continue;
             }
             // The finest level is half the image, so level 1.
@@ -177,14 +267,11 @@ impl PoseRefiner {
             };
             motion[axis].abs() < CORRECTION_SD_MAX * sd
         });
-        if !improved || !in_bounds {
-            return unchanged;
-        }
-        Refined {
+        (improved && in_bounds).then(|| Refined {
             world_from_camera: world_from_camera * estimate.given_from_real,
             correction_m: estimate.given_from_real.translation.vector.norm(),
             correction_rad: estimate.given_from_real.rotation.angle(),
-        }
+        })
     }
 
     /// The views' luminance, variance and depth at the given pose.
@@ -193,7 +280,8 @@ impl PoseRefiner {
         views: &[(&Coarse, &Pose, f32)],
         camera: &Intrinsics,
         world_from_camera: &Pose,
-    ) -> Level {
+        level: &mut Level,
+    ) {
         let pixels = camera.pixels();
         let views = &views[..views.len().min(REFINE_VIEWS)];
         self.maps.clear();
@@ -201,40 +289,25 @@ impl PoseRefiner {
         for ((coarse, world_from_view, _), map) in
             views.iter().zip(self.maps.chunks_exact_mut(pixels.max(1)))
         {
-            Projector::new(&coarse.mesh, world_from_view, camera, world_from_camera).draw(
+            let projector = Projector::new(
+                &coarse.mesh,
+                world_from_view,
+                camera,
+                world_from_camera,
+                &mut self.reach,
+            );
+            let rows = 0..camera.height;
+            draw(
+                self.isa,
+                &projector,
                 camera.width,
-                0..camera.height,
+                rows,
                 map,
                 &mut self.scratch,
             );
         }
-        let mut level = Level {
-            width: camera.width,
-            height: camera.height,
-            luminance: vec![0.0; pixels],
-            variance: vec![0.0; pixels],
-            depth_m: vec![0.0; pixels],
-            observed: Vec::new(),
-        };
-        for pixel in 0..pixels {
-            let mut seen = [(0.0f32, 0.0f32, 0.0f32, 0.0f32); REFINE_VIEWS];
-            let mut count = 0;
-            for (view, (coarse, _, weight)) in views.iter().enumerate() {
-                let sample = self.maps[view * pixels + pixel];
-                if sample != 0 {
-                    let (luminance, variance) = interpolate(coarse, sample);
-                    seen[count] = (sample_depth_m(sample), luminance, variance, *weight);
-                    count += 1;
-                }
-            }
-            if count > 0 {
-                let (luminance, variance, depth_m) = merge(&mut seen[..count]);
-                level.luminance[pixel] = luminance;
-                level.variance[pixel] = variance;
-                level.depth_m[pixel] = depth_m;
-            }
-        }
-        level
+        level.resize(camera.width, camera.height);
+        expect(self.isa, views, &self.maps, level);
     }
 
     /// One Gauss-Newton step; `None` when too little of the view is left.
@@ -252,44 +325,16 @@ impl PoseRefiner {
         }
         let scale = self.residual_scale();
         let cutoff = TUKEY * scale;
-        let mut hessian = [0.0f32; 36];
-        let mut gradient = [0.0f32; 8];
-        let mut hessian_sum = [0.0f64; 36];
-        let mut gradient_sum = [0.0f64; 8];
-        let gain = estimate.gain as f32;
-        for (points, residuals) in self.points.chunks(256).zip(self.residuals.chunks(256)) {
-            for (point, &residual) in points.iter().zip(residuals) {
-                // In predicted standard deviations; NaN left the image.
-                let normalised = residual * point.inverse_sd;
-                if residual.is_nan() || normalised.abs() >= cutoff {
-                    continue;
-                }
-                let tukey = 1.0 - (normalised / cutoff) * (normalised / cutoff);
-                let weight = tukey * tukey * point.inverse_sd * point.inverse_sd / (scale * scale);
-                let mut j = [0.0f32; 8];
-                for (j, jacobian) in j.iter_mut().zip(point.jacobian) {
-                    *j = gain * jacobian;
-                }
-                j[6] = point.luminance;
-                j[7] = 1.0;
-                let mut entry = 0;
-                for row in 0..8 {
-                    let weighted = weight * j[row];
-                    gradient[row] += weighted * residual;
-                    for value in &j[row..] {
-                        hessian[entry] += weighted * value;
-                        entry += 1;
-                    }
-                }
-            }
-            // Single precision within a chunk, double across: the sums keep their digits.
-            for (sum, part) in hessian_sum.iter_mut().zip(&mut hessian) {
-                *sum += f64::from(std::mem::take(part));
-            }
-            for (sum, part) in gradient_sum.iter_mut().zip(&mut gradient) {
-                *sum += f64::from(std::mem::take(part));
-            }
-        }
+        let mut sums = [0.0f64; HESSIAN + 8];
+        accumulate(
+            self.isa,
+            &self.points,
+            &self.residuals,
+            estimate.gain as f32,
+            (scale, cutoff),
+            &mut sums,
+        );
+        let (hessian_sum, gradient_sum) = sums.split_at(HESSIAN);
         let mut normal = Matrix8::zeros();
         let mut entry = 0;
         for row in 0..8 {
@@ -299,7 +344,7 @@ impl PoseRefiner {
                 entry += 1;
             }
         }
-        let mut right = Vector8::from_column_slice(&gradient_sum) / discount;
+        let mut right = Vector8::from_column_slice(gradient_sum) / discount;
         let motion = logarithm(&estimate.given_from_real);
         for axis in 0..8 {
             let (sd, deviation) = match axis {
@@ -338,44 +383,54 @@ impl PoseRefiner {
         let (gain, offset) = (estimate.gain as f32, estimate.offset as f32);
         let (fx, fy) = (camera.fx as f32, camera.fy as f32);
         let (cx, cy) = (camera.cx as f32, camera.cy as f32);
-        let (right, bottom) = ((level.width - 1) as f32, (level.height - 1) as f32);
-        self.residuals.clear();
+        let motion = Motion {
+            rotation: rotation.into(),
+            translation: translation.into(),
+            focal: (fx, fy),
+            center: (cx, cy),
+            gain,
+            offset,
+        };
+        self.residuals.resize(self.points.luminance.len(), 0.0);
         let mut compared = 0;
-        for point in &self.points {
-            let q = rotation * Vector3::from(point.in_camera) + translation;
-            let u = fx * q.x / q.z + cx;
-            let v = fy * q.y / q.z + cy;
-            let residual = if q.z > 0.0 && u >= 0.0 && v >= 0.0 && u < right && v < bottom {
-                compared += 1;
-                let (x, y) = (u as usize, v as usize);
-                let (right, down) = (u - x as f32, v - y as f32);
-                let at = y * level.width + x;
-                let upper = level.observed[at] * (1.0 - right) + level.observed[at + 1] * right;
-                let at = at + level.width;
-                let lower = level.observed[at] * (1.0 - right) + level.observed[at + 1] * right;
-                upper * (1.0 - down) + lower * down - gain * point.luminance - offset
-            } else {
-                f32::NAN
-            };
-            self.residuals.push(residual);
-        }
+        compare(
+            self.isa,
+            &self.points,
+            level,
+            &motion,
+            &mut self.residuals,
+            &mut compared,
+        );
         compared
+    }
+
+    /// How many levels catch the expected error; `None` when nothing is predicted.
+    fn level_count(
+        &mut self,
+        finest: &Level,
+        intrinsics: &Intrinsics,
+        noise: PoseNoise,
+    ) -> Option<usize> {
+        let depths = finest.depth_m.iter().copied().filter(|z| *z > 0.0);
+        if depths.clone().count() < PIXELS_MIN {
+            return None;
+        }
+        let median_m = middle(depths, &mut self.magnitudes);
+        let from_position = intrinsics.fx * noise.position_m / f64::from(median_m);
+        let from_rotation = intrinsics.fx * noise.rotation_rad;
+        let error_px = from_position.hypot(from_rotation);
+        Some(2 + usize::from(error_px > THIRD_LEVEL_PX) + usize::from(error_px > FOURTH_LEVEL_PX))
     }
 
     /// 1.4826 times the median of the residuals' magnitude in predicted standard deviations.
     fn residual_scale(&mut self) -> f32 {
-        self.magnitudes.clear();
-        self.magnitudes.extend(
-            self.residuals
-                .iter()
-                .zip(&self.points)
-                .filter(|(residual, _)| !residual.is_nan())
-                .map(|(residual, point)| residual.abs() * point.inverse_sd),
-        );
-        let middle = self.magnitudes.len() / 2;
-        let (_, &mut median, _) = self
-            .magnitudes
-            .select_nth_unstable_by(middle, f32::total_cmp);
+        let magnitudes = self
+            .residuals
+            .iter()
+            .zip(&self.points.inverse_sd)
+            .filter(|(residual, _)| !residual.is_nan())
+            .map(|(residual, inverse_sd)| residual.abs() * inverse_sd);
+        let median = middle(magnitudes, &mut self.magnitudes);
         (1.4826 * median).clamp(SCALE_MIN, SCALE_MAX)
     }
 
@@ -385,10 +440,10 @@ impl PoseRefiner {
         let sum: f64 = self
             .residuals
             .iter()
-            .zip(&self.points)
+            .zip(&self.points.inverse_sd)
             .filter(|(residual, _)| !residual.is_nan())
-            .map(|(residual, point)| {
-                f64::from((residual.abs() * point.inverse_sd).min(RESIDUAL_CAP))
+            .map(|(residual, inverse_sd)| {
+                f64::from((residual.abs() * inverse_sd).min(RESIDUAL_CAP))
             })
             .sum();
         if compared == 0 {
@@ -400,43 +455,55 @@ impl PoseRefiner {
 }
 
 impl Level {
-    /// Means over 2x2; predicted where at least three of the four are.
-    fn halved(&self) -> Self {
-        let (width, height) = (self.width / 2, self.height / 2);
-        let mut level = Self {
-            width,
-            height,
-            luminance: Vec::with_capacity(width * height),
-            variance: Vec::with_capacity(width * height),
-            depth_m: Vec::with_capacity(width * height),
-            observed: halved(&self.observed, self.width, self.height),
-        };
-        for y in 0..height {
-            for x in 0..width {
-                let first = 2 * y * self.width + 2 * x;
-                let four = [first, first + 1, first + self.width, first + self.width + 1];
-                let (mut count, mut luminance, mut variance, mut depth_m) = (0.0, 0.0, 0.0, 0.0);
-                for pixel in four {
-                    if self.depth_m[pixel] > 0.0 {
-                        count += 1.0;
-                        luminance += self.luminance[pixel];
-                        variance += self.variance[pixel];
-                        depth_m += self.depth_m[pixel];
-                    }
-                }
-                let scale = if count >= 3.0 { 1.0 / count } else { 0.0 };
-                level.luminance.push(luminance * scale);
-                level.variance.push(variance * scale);
-                level.depth_m.push(depth_m * scale);
-            }
+    fn resize(&mut self, width: usize, height: usize) {
+        (self.width, self.height) = (width, height);
+        for plane in [&mut self.luminance, &mut self.variance, &mut self.depth_m] {
+            plane.clear();
+            plane.resize(width * height, 0.0);
         }
-        level
     }
 }
 
-/// Means over 2x2; an odd last row or column is left out.
-fn halved(plane: &[f32], width: usize, height: usize) -> Vec<f32> {
-    let mut half = Vec::with_capacity((width / 2) * (height / 2));
+for_each_isa! {
+    /// Means over 2x2; predicted where at least three of the four are.
+    fn halve_level(fine: &Level, level: &mut Level) = halve_level_kernel;
+}
+
+#[inline(always)]
+fn halve_level_kernel(fine: &Level, level: &mut Level) {
+    let (width, height) = (fine.width / 2, fine.height / 2);
+    level.resize(width, height);
+    halve_kernel(&fine.observed, fine.width, fine.height, &mut level.observed);
+    for y in 0..height {
+        for x in 0..width {
+            let first = 2 * y * fine.width + 2 * x;
+            let four = [first, first + 1, first + fine.width, first + fine.width + 1];
+            let (mut count, mut luminance, mut variance, mut depth_m) = (0.0, 0.0, 0.0, 0.0);
+            for pixel in four {
+                if fine.depth_m[pixel] > 0.0 {
+                    count += 1.0;
+                    luminance += fine.luminance[pixel];
+                    variance += fine.variance[pixel];
+                    depth_m += fine.depth_m[pixel];
+                }
+            }
+            let scale = if count >= 3.0 { 1.0 / count } else { 0.0 };
+            let pixel = y * width + x;
+            level.luminance[pixel] = luminance * scale;
+            level.variance[pixel] = variance * scale;
+            level.depth_m[pixel] = depth_m * scale;
+        }
+    }
+}
+
+for_each_isa! {
+    /// Means over 2x2; an odd last row or column is left out.
+    fn halve(plane: &[f32], width: usize, height: usize, half: &mut Vec<f32>) = halve_kernel;
+}
+
+#[inline(always)]
+fn halve_kernel(plane: &[f32], width: usize, height: usize, half: &mut Vec<f32>) {
+    half.clear();
     for rows in plane.chunks_exact(2 * width).take(height / 2) {
         let (upper, lower) = rows.split_at(width);
         half.extend(
@@ -446,26 +513,211 @@ fn halved(plane: &[f32], width: usize, height: usize) -> Vec<f32> {
                 .map(|(upper, lower)| (upper[0] + upper[1] + lower[0] + lower[1]) / 4.0),
         );
     }
-    half
 }
 
-/// How many levels catch the expected error; `None` when nothing is predicted.
-fn level_count(finest: &Level, intrinsics: &Intrinsics, noise: PoseNoise) -> Option<usize> {
-    let mut depths: Vec<f32> = finest
-        .depth_m
-        .iter()
-        .copied()
-        .filter(|z| *z > 0.0)
-        .collect();
-    if depths.len() < PIXELS_MIN {
-        return None;
+/// The value with as many below as above, of positive values and zeros; 0 of none. Two passes over the bits find the
+/// same as sorting would.
+fn middle(values: impl Iterator<Item = f32> + Clone, work: &mut Vec<f32>) -> f32 {
+    const SHIFT: u32 = 20;
+    let mut histogram = [0usize; 1 << (32 - SHIFT)];
+    let mut count = 0;
+    for value in values.clone() {
+        histogram[(value.to_bits() >> SHIFT) as usize] += 1;
+        count += 1;
     }
-    let middle = depths.len() / 2;
-    let (_, &mut median_m, _) = depths.select_nth_unstable_by(middle, f32::total_cmp);
-    let from_position = intrinsics.fx * noise.position_m / f64::from(median_m);
-    let from_rotation = intrinsics.fx * noise.rotation_rad;
-    let error_px = from_position.hypot(from_rotation);
-    Some(2 + usize::from(error_px > THIRD_LEVEL_PX) + usize::from(error_px > FOURTH_LEVEL_PX))
+    let mut rank = count / 2;
+    for (bin, &members) in histogram.iter().enumerate() {
+        if rank < members {
+            work.clear();
+            work.extend(values.filter(|value| (value.to_bits() >> SHIFT) as usize == bin));
+            return *work.select_nth_unstable_by(rank, f32::total_cmp).1;
+        }
+        rank -= members;
+    }
+    0.0
+}
+
+/// Products of two of eight derivatives.
+const HESSIAN: usize = 36;
+
+for_each_isa! {
+    /// Adds up the weighted normal equations: the upper triangle row by row, then the gradient. `(scale, cutoff)` are
+    /// Tukey's, predicted standard deviations.
+    fn accumulate(
+        points: &Points,
+        residuals: &[f32],
+        gain: f32,
+        tukey: (f32, f32),
+        sums: &mut [f64; HESSIAN + 8],
+    ) = accumulate_kernel;
+}
+
+#[inline(always)]
+fn accumulate_kernel(
+    points: &Points,
+    residuals: &[f32],
+    gain: f32,
+    (scale, cutoff): (f32, f32),
+    sums: &mut [f64; HESSIAN + 8],
+) {
+    let inverse_scale2 = 1.0 / (scale * scale);
+    let mut parts = [[0.0f32; LANES]; HESSIAN + 8];
+    for (step, residuals) in residuals.chunks_exact(LANES).enumerate() {
+        let at = step * LANES..(step + 1) * LANES;
+        let inverse_sd = &points.inverse_sd[at.clone()];
+        let luminance = &points.luminance[at.clone()];
+        let mut j = [[1.0f32; LANES]; 8];
+        for (j, jacobian) in j.iter_mut().zip(&points.jacobian) {
+            for (j, jacobian) in j.iter_mut().zip(&jacobian[at.clone()]) {
+                *j = gain * jacobian;
+            }
+        }
+        j[6].copy_from_slice(luminance);
+        let mut weight = [0.0f32; LANES];
+        let mut residual = [0.0f32; LANES];
+        for lane in 0..LANES {
+            // In predicted standard deviations; NaN left the image.
+            let normalised = residuals[lane] * inverse_sd[lane];
+            let counts = normalised.abs() < cutoff;
+            let share = normalised / cutoff;
+            let tukey = 1.0 - share * share;
+            let w = tukey * tukey * inverse_sd[lane] * inverse_sd[lane] * inverse_scale2;
+            weight[lane] = if counts { w } else { 0.0 };
+            residual[lane] = if counts { residuals[lane] } else { 0.0 };
+        }
+        let mut entry = 0;
+        for row in 0..8 {
+            let mut weighted = [0.0f32; LANES];
+            for lane in 0..LANES {
+                weighted[lane] = weight[lane] * j[row][lane];
+                parts[HESSIAN + row][lane] += weighted[lane] * residual[lane];
+            }
+            for j in &j[row..] {
+                for lane in 0..LANES {
+                    parts[entry][lane] += weighted[lane] * j[lane];
+                }
+                entry += 1;
+            }
+        }
+        // Single precision within a chunk, double across: the sums keep their digits.
+        if step % 64 == 63 {
+            flush(&mut parts, sums);
+        }
+    }
+    flush(&mut parts, sums);
+}
+
+#[inline(always)]
+fn flush(parts: &mut [[f32; LANES]; HESSIAN + 8], sums: &mut [f64; HESSIAN + 8]) {
+    for (sum, part) in sums.iter_mut().zip(parts) {
+        *sum += part.iter().map(|&value| f64::from(value)).sum::<f64>();
+        *part = [0.0; LANES];
+    }
+}
+
+/// How the points are seen by an estimate.
+struct Motion {
+    /// Column by column.
+    rotation: [[f32; 3]; 3],
+    translation: [f32; 3],
+    focal: (f32, f32),
+    center: (f32, f32),
+    gain: f32,
+    offset: f32,
+}
+
+for_each_isa! {
+    /// Residuals of all points, NaN where they leave the image, and how many do not.
+    fn compare(
+        points: &Points,
+        level: &Level,
+        motion: &Motion,
+        residuals: &mut [f32],
+        compared: &mut usize,
+    ) = compare_kernel;
+}
+
+#[inline(always)]
+fn compare_kernel(
+    points: &Points,
+    level: &Level,
+    motion: &Motion,
+    residuals: &mut [f32],
+    compared: &mut usize,
+) {
+    let (right, bottom) = ((level.width - 1) as f32, (level.height - 1) as f32);
+    let [a, b, c] = motion.rotation;
+    let t = motion.translation;
+    for (step, residuals) in residuals.chunks_exact_mut(LANES).enumerate() {
+        let at = step * LANES..(step + 1) * LANES;
+        let [xs, ys, zs] = &points.in_camera;
+        let (xs, ys, zs) = (&xs[at.clone()], &ys[at.clone()], &zs[at.clone()]);
+        let luminance = &points.luminance[at];
+        let mut pixel = [0usize; LANES];
+        let mut inside = [false; LANES];
+        let mut fraction = [[0.0f32; LANES]; 2];
+        for lane in 0..LANES {
+            let (x, y, z) = (xs[lane], ys[lane], zs[lane]);
+            let q: [f32; 3] =
+                [0, 1, 2].map(|axis| a[axis] * x + b[axis] * y + c[axis] * z + t[axis]);
+            let u = motion.focal.0 * q[0] / q[2] + motion.center.0;
+            let v = motion.focal.1 * q[1] / q[2] + motion.center.1;
+            inside[lane] =
+                (z > 0.0) & (q[2] > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < right) & (v < bottom);
+            let (u, v) = if inside[lane] { (u, v) } else { (0.0, 0.0) };
+            // Of at most 2^13.
+            let (column, row) = (u as i32, v as i32);
+            fraction[0][lane] = u - column as f32;
+            fraction[1][lane] = v - row as f32;
+            pixel[lane] = row as usize * level.width + column as usize;
+        }
+        for lane in 0..LANES {
+            if !inside[lane] {
+                residuals[lane] = f32::NAN;
+                continue;
+            }
+            *compared += 1;
+            let (right, down) = (fraction[0][lane], fraction[1][lane]);
+            let upper = &level.observed[pixel[lane]..][..2];
+            let lower = &level.observed[pixel[lane] + level.width..][..2];
+            let upper = upper[0] * (1.0 - right) + upper[1] * right;
+            let lower = lower[0] * (1.0 - right) + lower[1] * right;
+            let observed = upper * (1.0 - down) + lower * down;
+            residuals[lane] = observed - motion.gain * luminance[lane] - motion.offset;
+        }
+    }
+}
+
+for_each_isa! {
+    /// Luminance, variance and depth from the maps of the views.
+    fn expect(
+        views: &[(&Coarse, &Pose, f32)],
+        maps: &[Sample],
+        level: &mut Level,
+    ) = expect_kernel;
+}
+
+#[inline(always)]
+fn expect_kernel(views: &[(&Coarse, &Pose, f32)], maps: &[Sample], level: &mut Level) {
+    let pixels = level.luminance.len();
+    for pixel in 0..pixels {
+        let mut seen = [(0.0f32, 0.0f32, 0.0f32, 0.0f32); REFINE_VIEWS];
+        let mut count = 0;
+        for (view, (coarse, _, weight)) in views.iter().enumerate() {
+            let sample = maps[view * pixels + pixel];
+            if sample != 0 {
+                let (luminance, variance) = interpolate(coarse, sample);
+                seen[count] = (sample_depth_m(sample), luminance, variance, *weight);
+                count += 1;
+            }
+        }
+        if count > 0 {
+            let (luminance, variance, depth_m) = merge(&mut seen[..count]);
+            level.luminance[pixel] = luminance;
+            level.variance[pixel] = variance;
+            level.depth_m[pixel] = depth_m;
+        }
+    }
 }
 
 /// Luminance and variance inside the triangle around a sample.
@@ -519,8 +771,13 @@ fn merge(seen: &mut [(f32, f32, f32, f32)]) -> (f32, f32, f32) {
     (luminance, variance / total + disagreement, depth_m / total)
 }
 
-/// The comparable pixels of a level: predicted together with their four neighbours.
-fn collect_points(level: &Level, camera: &Intrinsics, points: &mut Vec<Point>) {
+for_each_isa! {
+    /// The comparable pixels of a level: predicted together with their four neighbours.
+    fn collect_points(level: &Level, camera: &Intrinsics, points: &mut Points) = collect_kernel;
+}
+
+#[inline(always)]
+fn collect_kernel(level: &Level, camera: &Intrinsics, points: &mut Points) {
     points.clear();
     let width = level.width;
     let (fx, fy) = (camera.fx as f32, camera.fy as f32);
@@ -549,14 +806,11 @@ fn collect_points(level: &Level, camera: &Intrinsics, points: &mut Vec<Point>) {
                 pz * g[0] - px * g[2],
                 px * g[1] - py * g[0],
             ];
-            points.push(Point {
-                in_camera,
-                jacobian,
-                luminance: tau(pixel),
-                inverse_sd: 1.0 / (level.variance[pixel] + SENSOR_VARIANCE).sqrt(),
-            });
+            let inverse_sd = 1.0 / (level.variance[pixel] + SENSOR_VARIANCE).sqrt();
+            points.push(in_camera, jacobian, tau(pixel), inverse_sd);
         }
     }
+    points.pad();
 }
 
 /// (translation, rotation vector) of a small motion.

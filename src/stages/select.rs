@@ -3,7 +3,12 @@
 //! Poses -> indices of the nearest by view distance (metres), nearest first.
 //! The paper says "closest in terms of distance and viewing direction": D = |c - c_i| + 1 m/rad * angle here.
 
-use crate::model::pose::{Pose, view_distance_m};
+use arrayvec::ArrayVec;
+
+use crate::{
+    model::pose::{Pose, view_distance_m},
+    stages::interpolate::merge::VIEWS_MAX,
+};
 
 /// So many are recalled however far they are: a robot that comes back on another path has no others.
 const NEAREST_KEPT: usize = 3;
@@ -17,23 +22,47 @@ pub fn select_nearest<'a>(
     count: usize,
     distance_max_m: f64,
 ) -> Vec<usize> {
-    let mut nearest: Vec<(f64, usize)> = world_from_views
-        .map(|world_from_view| {
-            view_distance_m(world_from_view, world_from_camera, metres_per_radian)
-        })
-        .enumerate()
-        .map(|(index, distance_m)| (distance_m, index))
-        .collect();
-    let by_distance = |a: &(f64, usize), b: &(f64, usize)| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1));
-    if nearest.len() > count {
-        nearest.select_nth_unstable_by(count, by_distance);
-        nearest.truncate(count);
+    let mut selected = Vec::new();
+    select_into(
+        world_from_views,
+        world_from_camera,
+        metres_per_radian,
+        count,
+        distance_max_m,
+        &mut selected,
+    );
+    selected
+}
+
+/// As [`select_nearest`], into a vector whose memory is used again.
+pub fn select_into<'a>(
+    world_from_views: impl Iterator<Item = &'a Pose>,
+    world_from_camera: &Pose,
+    metres_per_radian: f64,
+    count: usize,
+    distance_max_m: f64,
+    selected: &mut Vec<usize>,
+) {
+    // Sorted by distance; the earlier index stays before an equal distance.
+    let mut nearest = ArrayVec::<(f64, usize), VIEWS_MAX>::new();
+    let count = count.min(VIEWS_MAX);
+    for (index, world_from_view) in world_from_views.enumerate() {
+        let distance_m = view_distance_m(world_from_view, world_from_camera, metres_per_radian);
+        if nearest.len() == count {
+            if nearest.last().is_none_or(|last| last.0 <= distance_m) {
+                continue;
+            }
+            nearest.pop();
+        }
+        let rank = nearest.partition_point(|held| held.0 <= distance_m);
+        nearest.insert(rank, (distance_m, index));
     }
-    nearest.sort_unstable_by(by_distance);
-    nearest
-        .into_iter()
-        .enumerate()
-        .filter(|(rank, (distance_m, _))| *rank < NEAREST_KEPT || *distance_m <= distance_max_m)
-        .map(|(_, (_, index))| index)
-        .collect()
+    selected.clear();
+    selected.extend(
+        nearest
+            .into_iter()
+            .enumerate()
+            .filter(|(rank, (distance_m, _))| *rank < NEAREST_KEPT || *distance_m <= distance_max_m)
+            .map(|(_, (_, index))| index),
+    );
 }

@@ -6,8 +6,9 @@
 //! the robust preset). Edges may widen the prior for the score (step 4).
 
 use crate::{
+    lanes::ln,
     model::belief::{Belief, CHANNELS},
-    stages::{lanes::ln, update::UpdateRules},
+    stages::update::UpdateRules,
 };
 
 pub(crate) const DEGREE: usize = 12;
@@ -96,37 +97,31 @@ fn digamma(x: f64) -> f64 {
         - r * (1.0 / 12.0 - r * (1.0 / 120.0 - r * (1.0 / 252.0 - r * (1.0 / 240.0 - r / 132.0))))
 }
 
-/// Per channel the parts of the surprise that need no logarithm, and what goes under the shared ones:
-/// `(plain, beta ratio, sigma ratio)`. Beliefs are `(beta, sigma)`; `deviation` is the observation's from tau0.
+/// The parts of a channel's surprise that need no logarithm. Beliefs are `(beta, sigma)`; `deviation` is the
+/// observation's from tau0.
 #[inline(always)]
-pub fn channel_terms(
-    alpha: f32,
-    prior: (f32, f32),
-    posterior: (f32, f32),
-    deviation: f32,
-) -> (f32, f32, f32) {
+pub fn plain_terms(alpha: f32, prior: (f32, f32), posterior: (f32, f32), deviation: f32) -> f32 {
     let (beta0, sigma0) = prior;
     let (beta, sigma) = posterior;
     let precision = alpha / beta;
     // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
     let moved = sigma * deviation;
-    let plain =
-        (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5;
-    (plain, beta / beta0, sigma0 / sigma)
+    (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5
 }
 
-/// (16) to (23), nats. `ratios` are the products of the channels' ratios.
+/// (16) to (23), nats. `plain` is the channels' sum; beta and sigma, of prior and posterior, are their products: at most
+/// 65504^3.
 #[inline(always)]
 pub fn total(
     alpha0: f32,
     plain: f32,
-    beta_ratios: f32,
-    sigma_ratios: f32,
+    (beta0, sigma0): (f32, f32),
+    (beta, sigma): (f32, f32),
     gamma: &GammaTerm,
 ) -> f32 {
     let sum = plain
-        + alpha0 * ln(beta_ratios)
-        + 0.5 * ln(sigma_ratios)
+        + alpha0 * ln(beta / beta0)
+        + 0.5 * ln(sigma0 / sigma)
         + CHANNELS as f32 * gamma.at(alpha0);
     // A divergence is never negative; rounding may be.
     sum.max(0.0)
@@ -141,19 +136,26 @@ pub fn surprise(
     gamma: &GammaTerm,
 ) -> f32 {
     let mut plain = 0.0;
-    let (mut beta_ratios, mut sigma_ratios) = (1.0, 1.0);
     for (c, observed) in observed.into_iter().enumerate() {
-        let (p, b, s) = channel_terms(
+        plain += plain_terms(
             posterior.alpha,
             (prior.beta[c], prior.sigma[c]),
             (posterior.beta[c], posterior.sigma[c]),
             observed - prior.tau[c],
         );
-        plain += p;
-        beta_ratios *= b;
-        sigma_ratios *= s;
     }
-    total(prior.alpha, plain, beta_ratios, sigma_ratios, gamma)
+    let products = |belief: &Belief| {
+        let [b0, b1, b2] = belief.beta;
+        let [s0, s1, s2] = belief.sigma;
+        (b0 * b1 * b2, s0 * s1 * s2)
+    };
+    total(
+        prior.alpha,
+        plain,
+        products(prior),
+        products(posterior),
+        gamma,
+    )
 }
 
 /// From this weight on an earlier appearance takes part.
@@ -230,37 +232,45 @@ pub fn edge_gradient_row(
     gradient: &mut [f32],
 ) {
     let width = gradient.len();
-    gradient.fill(0.0);
     let (above, here, below) = plane;
     let (seen_above, seen, seen_below) = coverage;
-    let squared = |a: f32, seen_a: f32, b: f32, seen_b: f32| {
-        let both = if seen_a > 0.0 && seen_b > 0.0 {
-            1.0
-        } else {
-            0.0
-        };
-        ((a - b) * (a - b) * both, both)
-    };
+    // Beyond the image there is nothing to compare with: any row does, with no weight.
+    let (above, has_above) = above.map_or((here, 0.0), |row| (row, 1.0));
+    let (below, has_below) = below.map_or((here, 0.0), |row| (row, 1.0));
+    let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
+    let seen_above = &seen_above.unwrap_or(seen)[..width];
+    let seen_below = &seen_below.unwrap_or(seen)[..width];
+    let seen = &seen[..width];
     for x in 0..width {
-        let (left, has_left) = if x > 0 {
-            squared(here[x], seen[x], here[x - 1], seen[x - 1])
-        } else {
-            (0.0, 0.0)
-        };
-        let (right, has_right) = if x + 1 < width {
-            squared(here[x], seen[x], here[x + 1], seen[x + 1])
-        } else {
-            (0.0, 0.0)
-        };
-        gradient[x] = (left + right) / (has_left + has_right).max(1.0);
+        let (up, has_up) = squared(here[x], seen[x], above[x], seen_above[x], has_above);
+        let (down, has_down) = squared(here[x], seen[x], below[x], seen_below[x], has_below);
+        gradient[x] = mean_of_two(up + down, has_up + has_down);
     }
-    let row = |row: Option<&[f32]>, seen_row: Option<&[f32]>, x: usize| match (row, seen_row) {
-        (Some(row), Some(seen_row)) => squared(here[x], seen[x], row[x], seen_row[x]),
-        _ => (0.0, 0.0),
+    if width < 2 {
+        return;
+    }
+    for x in 1..width - 1 {
+        let (left, has_left) = squared(here[x], seen[x], here[x - 1], seen[x - 1], 1.0);
+        let (right, has_right) = squared(here[x], seen[x], here[x + 1], seen[x + 1], 1.0);
+        gradient[x] += mean_of_two(left + right, has_left + has_right);
+    }
+    for (x, neighbour) in [(0, 1), (width - 1, width - 2)] {
+        gradient[x] += squared(here[x], seen[x], here[neighbour], seen[neighbour], 1.0).0;
+    }
+}
+
+/// Squared difference and how much it counts.
+#[inline(always)]
+fn squared(a: f32, seen_a: f32, b: f32, seen_b: f32, there: f32) -> (f32, f32) {
+    let both = if (seen_a > 0.0) & (seen_b > 0.0) {
+        there
+    } else {
+        0.0
     };
-    for (x, gradient) in gradient.iter_mut().enumerate() {
-        let (up, has_up) = row(above, seen_above, x);
-        let (down, has_down) = row(below, seen_below, x);
-        *gradient += (up + down) / (has_up + has_down).max(1.0);
-    }
+    ((a - b) * (a - b) * both, both)
+}
+
+#[inline(always)]
+fn mean_of_two(sum: f32, count: f32) -> f32 {
+    if count > 1.0 { 0.5 * sum } else { sum }
 }

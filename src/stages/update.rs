@@ -6,8 +6,8 @@
 
 use crate::{
     config::{Settings, UnseenStart},
+    lanes::exp,
     model::belief::{Belief, CHANNELS},
-    stages::lanes::exp,
 };
 
 /// Where the exponent of (10) is cut off: sigma_p has long reached its upper bound there.
@@ -59,12 +59,14 @@ impl UpdateRules {
         let (beta0, tau0, sigma0) = prior;
         let difference = observed - tau0;
         let mut sigma_p = self.sigma_p(sigma0, beta0 / alpha0);
-        let beta = self.forgetting * beta0 + difference * difference / (2.0 * (sigma_p + 1.0));
+        let mut share = 1.0 / (sigma_p + 1.0);
+        let beta = self.forgetting * beta0 + 0.5 * difference * difference * share;
         if self.second_look {
             sigma_p = self.sigma_p(sigma0, beta / self.alpha(alpha0));
+            share = 1.0 / (sigma_p + 1.0);
         }
         // (14) as a step from tau0: no digits are lost when little moves.
-        let sigma = sigma_p / (sigma_p + 1.0);
+        let sigma = sigma_p * share;
         (beta, tau0 + sigma * difference, sigma)
     }
 

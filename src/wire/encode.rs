@@ -10,8 +10,8 @@ use prost_types::Timestamp;
 use super::{picture, proto};
 use crate::{
     model::{
-        camera::{Calibration, Intrinsics},
-        frame::{Frame, RgbImage},
+        camera::{Calibration, Intrinsics, RigCalibration, SideCalibrations},
+        frame::{DepthSource, Frame, GreyImage, RgbImage, RigFrame},
         pose::Pose,
         refusal::Refusal,
         report::{Region, Report},
@@ -95,15 +95,49 @@ pub fn intrinsics(intrinsics: &Intrinsics) -> proto::Intrinsics {
     }
 }
 
+/// Of a camera alone.
 pub fn calibration(calibration: &Calibration) -> proto::Calibration {
-    let mut middle = intrinsics(&calibration.intrinsics);
-    if let Some(lens) = &calibration.distortion {
-        middle.distortion_model = "plumb_bob".to_owned();
-        middle.distortion = vec![lens.k1, lens.k2, lens.p1, lens.p2, lens.k3];
-    }
     proto::Calibration {
-        middle: Some(middle),
+        middle: Some(lens(calibration)),
         ..proto::Calibration::default()
+    }
+}
+
+pub fn rig_calibration(rig: &RigCalibration) -> proto::Calibration {
+    let mut message = calibration(&rig.middle);
+    if let Some(SideCalibrations { left, right }) = &rig.sides {
+        message.left = Some(lens(&left.camera));
+        message.right = Some(lens(&right.camera));
+        message.middle_from_left = Some(pose(&left.middle_from_side));
+        message.middle_from_right = Some(pose(&right.middle_from_side));
+    }
+    if let Some(plate) = &rig.plate {
+        message.marker_in_plate = plate.marker_in_plate.iter().map(vector).collect();
+        message.camera_from_plate = Some(pose(&plate.camera_from_plate));
+    }
+    message
+}
+
+fn lens(calibration: &Calibration) -> proto::Intrinsics {
+    let mut message = intrinsics(&calibration.intrinsics);
+    if let Some(lens) = &calibration.distortion {
+        message.distortion_model = "plumb_bob".to_owned();
+        message.distortion = vec![lens.k1, lens.k2, lens.p1, lens.p2, lens.k3];
+    }
+    message
+}
+
+/// `marker_in_world`: metres, in the calibration's order; `None` for what the tracker does not see.
+pub fn markers(stamp_ns: i64, marker_in_world: &[Option<Point3<f64>>]) -> proto::Markers {
+    proto::Markers {
+        stamp: Some(timestamp(stamp_ns)),
+        markers: marker_in_world
+            .iter()
+            .map(|marker| proto::Marker {
+                position: marker.as_ref().map(vector),
+                visible: marker.is_some(),
+            })
+            .collect(),
     }
 }
 
@@ -111,14 +145,39 @@ pub fn calibration(calibration: &Calibration) -> proto::Calibration {
 pub fn frame(frame: &Frame) -> proto::Frame {
     let Intrinsics { width, height, .. } = frame.intrinsics;
     let noise = frame.pose_noise;
+    let (mut depth, mut left, mut right) = (None, None, None);
+    match &frame.depth {
+        DepthSource::Given(depth_m) => {
+            depth = Some(plane(width, height, depth_m.iter().copied()));
+        }
+        DepthSource::Sides(sides) => {
+            left = Some(mono8(&sides.left.image));
+            right = Some(mono8(&sides.right.image));
+        }
+    }
     proto::Frame {
         stamp: Some(timestamp(frame.stamp_ns)),
         sequence: frame.sequence,
         image: Some(rgb8(&frame.image)),
-        depth: Some(plane(width, height, frame.depth_m.iter().copied())),
+        left,
+        right,
+        depth,
         world_from_camera: Some(pose(&frame.world_from_camera)),
         pose_position_sd: noise.map_or(0.0, |noise| noise.position_m),
         pose_rotation_sd: noise.map_or(0.0, |noise| noise.rotation_rad),
+        ..proto::Frame::default()
+    }
+}
+
+/// As a rig sends it: raw pixels, markers; the calibration travels on its own key.
+pub fn rig_frame(frame: &RigFrame) -> proto::Frame {
+    proto::Frame {
+        stamp: Some(timestamp(frame.stamp_ns)),
+        sequence: frame.sequence,
+        image: Some(rgb8(&frame.image)),
+        left: Some(mono8(&frame.left)),
+        right: Some(mono8(&frame.right)),
+        markers: Some(markers(frame.stamp_ns, &frame.marker_in_world)),
         ..proto::Frame::default()
     }
 }
@@ -135,6 +194,10 @@ fn image(encoding: &str, width: usize, height: usize, data: Vec<u8>) -> proto::I
 
 pub fn rgb8(rgb: &RgbImage) -> proto::Image {
     image("rgb8", rgb.width, rgb.height, rgb.data.clone())
+}
+
+pub fn mono8(grey: &GreyImage) -> proto::Image {
+    image("mono8", grey.width, grey.height, grey.data.clone())
 }
 
 /// 32FC1.

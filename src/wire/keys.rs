@@ -1,7 +1,7 @@
 //! Where messages travel: key expressions below a root, and the encodings that name the messages.
 //!
 //! ```text
-//! <root>/<place>/<robot>/<camera>/{calibration|frame|pose|truth}     from robots
+//! <root>/<place>/<robot>/<camera>/{calibration|frame|pose|markers|truth} from robots
 //! <root>/<place>/<robot>/<camera>/surprise/{report|map|...|rejected} from the service
 //! <root>/<place>/@memory/{prior|evaluate|views|status}               queryables
 //! <root>/<place>/@live/robot/<robot>/<camera>                        liveliness of cameras
@@ -20,6 +20,7 @@ const ID_LENGTH_MAX: usize = 64;
 pub const FRAME: &str = "frame";
 pub const CALIBRATION: &str = "calibration";
 pub const POSE: &str = "pose";
+pub const MARKERS: &str = "markers";
 /// What really is there, as JSON; from simulated robots only.
 pub const TRUTH: &str = "truth";
 pub const REPORT: &str = "surprise/report";

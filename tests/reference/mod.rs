@@ -14,7 +14,7 @@ pub mod recall;
 
 pub mod scene;
 
-use surprised::engine::isa::Isa;
+use surprised::isa::Isa;
 
 /// SplitMix64: the same numbers on every machine.
 pub struct Random(pub u64);

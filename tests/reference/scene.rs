@@ -6,7 +6,7 @@ use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use surprised::model::{
     belief::{Belief, CHANNELS, Record, rgb_from_ycbcr},
     camera::Intrinsics,
-    frame::{Frame, RgbImage, Source},
+    frame::{DepthSource, Frame, RgbImage, Source},
     pose::Pose,
     viewpoint::{Coarse, Mesh, Viewpoint},
 };
@@ -118,7 +118,7 @@ impl Scene {
                 height: camera.height,
                 data: picture.colour.iter().flat_map(rgb).collect(),
             },
-            depth_m: picture.depth_m,
+            depth: DepthSource::Given(picture.depth_m),
             intrinsics: *camera,
             world_from_camera: *world_from_camera,
             pose_noise: None,

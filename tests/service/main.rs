@@ -16,6 +16,8 @@ mod poses;
 
 mod calibrations;
 
+mod rigs;
+
 mod pulls;
 
 mod neighbours;

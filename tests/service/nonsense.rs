@@ -3,12 +3,15 @@
 use surprised::{
     config::Settings,
     wire::{
-        decode::{self, Limits},
+        decode::{self, Limits, PicturedDepth},
         encode, keys, proto,
     },
 };
 
-use crate::rig::{ROOT, Rig, calibration, camera, next_report, posed};
+use crate::{
+    rig::{ROOT, Rig, calibration, camera, next_report, posed},
+    rigs::rig_frame,
+};
 
 const MESSAGES: usize = 10_000;
 
@@ -70,7 +73,7 @@ fn seeds() -> Vec<Vec<u8>> {
         ("jpeg", image::ImageFormat::Jpeg),
         ("png", image::ImageFormat::Png),
     ];
-    let mut seeds = vec![encode::bytes(&good)];
+    let mut seeds = vec![encode::bytes(&good), encode::bytes(&rig_frame(&head, 1))];
     for (encoding, format) in encodings {
         let rgb = good.image.clone().expect("an image");
         let picture =
@@ -119,8 +122,17 @@ fn decoding_nonsense_gives_a_refusal_or_a_sane_frame() {
                 frames += 1;
                 let pixels = pictures.image.width * pictures.image.height;
                 assert_eq!(pictures.image.data.len(), 3 * pixels);
-                assert_eq!(pictures.depth_m.len(), pixels);
-                assert!(pictures.depth_m.iter().all(|z| z.is_finite() && *z >= 0.0));
+                match pictures.depth {
+                    PicturedDepth::Given(depth_m) => {
+                        assert_eq!(depth_m.len(), pixels);
+                        assert!(depth_m.iter().all(|z| z.is_finite() && *z >= 0.0));
+                    }
+                    PicturedDepth::Sides { left, right } => {
+                        for side in [left, right] {
+                            assert_eq!(side.data.len(), side.width * side.height);
+                        }
+                    }
+                }
                 if let Some(pose) = frame.world_from_camera {
                     assert!((pose.rotation.norm() - 1.0).abs() < 1e-6);
                 }
@@ -132,6 +144,7 @@ fn decoding_nonsense_gives_a_refusal_or_a_sane_frame() {
         }
         // The other messages share most of the checks.
         drop(decode::pose_sample(&bytes));
+        drop(decode::markers_sample(&bytes));
         drop(
             decode::message(&bytes)
                 .and_then(|message: proto::Calibration| decode::calibration(&message)),
@@ -162,7 +175,13 @@ async fn ten_thousand_messages_of_nonsense_harm_nobody() {
     let mut noise = Noise(2);
     let mut settled = 0;
     for index in 0..MESSAGES {
-        let leaf = [keys::FRAME, keys::FRAME, keys::POSE, keys::CALIBRATION][noise.below(4)];
+        let leaf = [
+            keys::FRAME,
+            keys::FRAME,
+            keys::POSE,
+            keys::MARKERS,
+            keys::CALIBRATION,
+        ][noise.below(5)];
         // Robots and places as many as names allow, and names that are none.
         let key = match noise.below(10) {
             0 => format!("{ROOT}/p{}/r/c/{leaf}", noise.below(1000)),
@@ -173,6 +192,7 @@ async fn ten_thousand_messages_of_nonsense_harm_nobody() {
         let encoding = match (noise.below(10), leaf) {
             (0, _) => zenoh::bytes::Encoding::TEXT_PLAIN,
             (_, keys::POSE) => keys::encoding::<proto::PoseSample>(),
+            (_, keys::MARKERS) => keys::encoding::<proto::Markers>(),
             (_, keys::CALIBRATION) => keys::encoding::<proto::Calibration>(),
             _ => keys::encoding::<proto::Frame>(),
         };

@@ -6,7 +6,7 @@ use surprised::{
     config::{Preset, Settings},
     model::{
         camera::{Calibration, Intrinsics},
-        frame::{Frame, RgbImage, Source},
+        frame::{DepthSource, Frame, RgbImage, Source},
         pose::Pose,
     },
     service::{Options, ServeError, Service, session::ZenohOptions},
@@ -214,7 +214,7 @@ pub fn wall(camera: &CameraPath, sequence: u64, x_m: f64) -> Frame {
             height: CAMERA.height,
             data,
         },
-        depth_m: vec![depth_m as f32; CAMERA.pixels()],
+        depth: DepthSource::Given(vec![depth_m as f32; CAMERA.pixels()]),
         intrinsics: CAMERA,
         world_from_camera: Pose::translation(x_m, 0.0, 0.0),
         pose_noise: None,

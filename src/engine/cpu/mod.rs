@@ -6,24 +6,25 @@ mod strips;
 
 use std::sync::{Arc, Mutex};
 
-use rayon::ThreadPool;
+use arrayvec::ArrayVec;
+use rayon::{ThreadPool, prelude::*};
 
 use crate::{
     config::Settings,
-    engine::isa::Isa,
+    isa::{Isa, for_each_isa},
     model::{
         belief::{CHANNELS, Record, ycbcr_from_rgb},
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::Viewpoint,
+        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
-        exposure::exposure_gain,
+        exposure::exposure_gain_on,
         interpolate::{
-            merge::{MergeRules, MergeView},
+            merge::{MergeRules, MergeView, VIEWS_MAX},
             prior::{self, Prior},
-            project::Projector,
+            project::{Projector, Reach},
         },
         surprise::GammaTerm,
         update::UpdateRules,
@@ -33,8 +34,8 @@ use crate::{
 use score::{ScoreRules, ScoreScratch};
 use strips::StripScratch;
 
-/// Rows of a strip: its maps of seven views of 640 pixels stay within 600 KB, a core's second-level cache.
-const STRIP_ROWS: usize = 16;
+/// Rows of a strip: its maps of seven views of 640 pixels stay within 900 KB, a core's second-level cache.
+const STRIP_ROWS: usize = 24;
 
 /// A viewpoint to recall from.
 #[derive(Clone, Copy)]
@@ -56,24 +57,53 @@ pub struct Observation {
 
 impl Observation {
     pub fn new(image: &RgbImage) -> Self {
-        let pixels = image.width * image.height;
-        let mut planes: [Vec<f32>; CHANNELS] = std::array::from_fn(|_| Vec::with_capacity(pixels));
-        for rgb in image.data.chunks_exact(3) {
-            let ycbcr = ycbcr_from_rgb([f32::from(rgb[0]), f32::from(rgb[1]), f32::from(rgb[2])]);
-            for (plane, value) in planes.iter_mut().zip(ycbcr) {
-                plane.push(value);
-            }
+        let mut observation = Self::default();
+        observation.read(image, Isa::Portable);
+        observation
+    }
+
+    fn read(&mut self, image: &RgbImage, isa: Isa) {
+        (self.width, self.height) = (image.width, image.height);
+        for plane in &mut self.planes {
+            plane.resize(image.width * image.height, 0.0);
         }
-        Self {
-            width: image.width,
-            height: image.height,
-            planes,
-        }
+        let [y, cb, cr] = &mut self.planes;
+        transform_colours(isa, &image.data, y, cb, cr);
     }
 
     fn row(&self, y: usize) -> [&[f32]; CHANNELS] {
         std::array::from_fn(|channel| &self.planes[channel][y * self.width..][..self.width])
     }
+}
+
+for_each_isa! {
+    fn transform_colours(rgb: &[u8], y: &mut [f32], cb: &mut [f32], cr: &mut [f32]) = transform_kernel;
+}
+
+#[inline(always)]
+fn transform_kernel(rgb: &[u8], y: &mut [f32], cb: &mut [f32], cr: &mut [f32]) {
+    let planes = y.iter_mut().zip(cb).zip(cr);
+    for (rgb, ((y, cb), cr)) in rgb.chunks_exact(3).zip(planes) {
+        [*y, *cb, *cr] = ycbcr_from_rgb([f32::from(rgb[0]), f32::from(rgb[1]), f32::from(rgb[2])]);
+    }
+}
+
+for_each_isa! {
+    fn join(mesh: &mut Mesh, cut: MeshCut) = join_kernel;
+}
+
+#[inline(always)]
+fn join_kernel(mesh: &mut Mesh, cut: MeshCut) {
+    mesh.join(cut);
+}
+
+for_each_isa! {
+    fn reduce(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) = reduce_kernel;
+}
+
+#[inline(always)]
+fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) {
+    coarse.reduce(mesh, records, cut);
 }
 
 /// What a frame did to the prior.
@@ -95,6 +125,8 @@ pub struct CpuEngine {
     exposure_gain: bool,
     /// One a thread; never contended.
     scratch: Vec<Mutex<(StripScratch, ScoreScratch)>>,
+    /// One a view.
+    reaches: Mutex<[Reach; VIEWS_MAX]>,
 }
 
 impl CpuEngine {
@@ -122,7 +154,19 @@ impl CpuEngine {
             },
             exposure_gain: settings.exposure_gain,
             scratch,
+            reaches: Mutex::default(),
         }
+    }
+
+    /// Takes an image apart into planes; memory that is there is used again.
+    pub fn observe(&self, image: &RgbImage, observation: &mut Observation) {
+        observation.read(image, self.isa);
+    }
+
+    /// Makes what follows from a mesh's depth and its records when they are stored.
+    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+        join(self.isa, mesh, cut);
+        reduce(self.isa, coarse, mesh, records, cut);
     }
 
     /// Interpolates the beliefs at a pose from at most 16 views into `prior`.
@@ -133,18 +177,24 @@ impl CpuEngine {
         world_from_camera: &Pose,
         prior: &mut Prior,
     ) {
-        let projectors: Vec<Projector> = views
+        let mut reaches = self
+            .reaches
+            .lock()
+            .expect("never held by a panicked caller");
+        let projectors: ArrayVec<Projector, VIEWS_MAX> = views
             .iter()
-            .map(|view| {
+            .zip(reaches.iter_mut())
+            .map(|(view, reach)| {
                 Projector::new(
                     &view.viewpoint.mesh,
                     &view.viewpoint.world_from_camera,
                     intrinsics,
                     world_from_camera,
+                    reach,
                 )
             })
             .collect();
-        let merge_views: Vec<MergeView> = views
+        let merge_views: ArrayVec<MergeView, VIEWS_MAX> = views
             .iter()
             .map(|view| MergeView {
                 records: &view.viewpoint.records,
@@ -156,25 +206,28 @@ impl CpuEngine {
             .collect();
         prior.resize(intrinsics.width, intrinsics.height);
         let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
-        self.pool.install(|| {
-            use rayon::prelude::*;
-            prior
-                .data
-                .par_chunks_mut(strip_values)
-                .enumerate()
-                .for_each(|(strip, rows)| {
-                    let (scratch, _) = &mut *self.thread_scratch();
-                    scratch.recall(
-                        self.isa,
-                        &projectors,
-                        &merge_views,
-                        self.merge_rules,
-                        intrinsics.width,
-                        strip * STRIP_ROWS,
-                        rows,
-                    );
-                });
-        });
+        let recall = |(strip, rows): (usize, &mut [f32])| {
+            let (scratch, _) = &mut *self.thread_scratch();
+            scratch.recall(
+                self.isa,
+                &projectors,
+                &merge_views,
+                self.merge_rules,
+                intrinsics.width,
+                strip * STRIP_ROWS,
+                rows,
+            );
+        };
+        let data = &mut prior.data;
+        if self.is_alone() {
+            data.chunks_mut(strip_values).enumerate().for_each(recall);
+        } else {
+            self.pool.install(|| {
+                data.par_chunks_mut(strip_values)
+                    .enumerate()
+                    .for_each(recall);
+            });
+        }
     }
 
     /// Updates the prior with an observation of the same size and measures the surprise.
@@ -186,14 +239,17 @@ impl CpuEngine {
             "the prior is recalled for the frame's camera"
         );
         score.gain = if self.exposure_gain {
-            exposure_gain((0..height).map(|y| {
-                let row = prior.row(y);
-                (
-                    row.plane(prior::TAU),
-                    row.plane(prior::COVERAGE),
-                    observation.row(y)[0],
-                )
-            }))
+            exposure_gain_on(
+                self.isa,
+                (0..height).map(|y| {
+                    let row = prior.row(y);
+                    (
+                        row.plane(prior::TAU),
+                        row.plane(prior::COVERAGE),
+                        observation.row(y)[0],
+                    )
+                }),
+            )
         } else {
             1.0
         };
@@ -201,38 +257,52 @@ impl CpuEngine {
         score.posterior.resize(width * height, Record::default());
         let inverse_gain = 1.0 / score.gain;
         let strip_pixels = STRIP_ROWS * width;
-        self.pool.install(|| {
-            use rayon::prelude::*;
-            score
-                .surprise
-                .par_chunks_mut(strip_pixels)
-                .zip(score.posterior.par_chunks_mut(strip_pixels))
+        let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
+            let (_, scratch) = &mut *self.thread_scratch();
+            let rows = surprise
+                .chunks_exact_mut(width)
+                .zip(posterior.chunks_exact_mut(width));
+            for (row, (surprise, posterior)) in rows.enumerate() {
+                let y = strip * STRIP_ROWS + row;
+                score::score_row(
+                    self.isa,
+                    prior,
+                    y,
+                    observation.row(y),
+                    inverse_gain,
+                    &self.score_rules,
+                    scratch,
+                    surprise,
+                    posterior,
+                );
+            }
+        };
+        let (surprise, posterior) = (&mut score.surprise, &mut score.posterior);
+        if self.is_alone() {
+            surprise
+                .chunks_mut(strip_pixels)
+                .zip(posterior.chunks_mut(strip_pixels))
                 .enumerate()
-                .for_each(|(strip, (surprise, posterior))| {
-                    let (_, scratch) = &mut *self.thread_scratch();
-                    let rows = surprise
-                        .chunks_exact_mut(width)
-                        .zip(posterior.chunks_exact_mut(width));
-                    for (row, (surprise, posterior)) in rows.enumerate() {
-                        let y = strip * STRIP_ROWS + row;
-                        score::score_row(
-                            self.isa,
-                            prior,
-                            y,
-                            observation.row(y),
-                            inverse_gain,
-                            &self.score_rules,
-                            scratch,
-                            surprise,
-                            posterior,
-                        );
-                    }
-                });
-        });
+                .for_each(update);
+        } else {
+            self.pool.install(|| {
+                surprise
+                    .par_chunks_mut(strip_pixels)
+                    .zip(posterior.par_chunks_mut(strip_pixels))
+                    .enumerate()
+                    .for_each(update);
+            });
+        }
+    }
+
+    /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
+    fn is_alone(&self) -> bool {
+        self.pool.current_num_threads() == 1
     }
 
     fn thread_scratch(&self) -> std::sync::MutexGuard<'_, (StripScratch, ScoreScratch)> {
-        let thread = rayon::current_thread_index().expect("runs inside the pool");
+        // The caller's own thread where there is only one.
+        let thread = self.pool.current_thread_index().unwrap_or(0);
         self.scratch[thread]
             .lock()
             .expect("a thread that panicked ends the process")

@@ -3,12 +3,12 @@
 
 use crate::{
     config::UnseenStart,
-    engine::isa::for_each_isa,
-    model::belief::{Belief, CHANNELS, Record},
+    isa::for_each_isa,
+    lanes::{LANES, Lanes, bits, members, prefetch},
+    model::belief::{Belief, BeliefLanes, CHANNELS, Record},
     stages::{
         interpolate::prior::{self, Prior, PriorRow},
-        lanes::{LANES, Lanes},
-        surprise::{GammaTerm, P2_MIN, channel_terms, edge_gradient_row, joint_surprise, total},
+        surprise::{GammaTerm, P2_MIN, edge_gradient_row, joint_surprise, plain_terms, total},
         update::UpdateRules,
     },
 };
@@ -85,16 +85,29 @@ fn score_row_kernel(
     for start in (0..width).step_by(LANES) {
         let count = LANES.min(width - start);
         let mut step = Step::load(row, observed, inverse_gain, start, count);
-        if widened {
+        let mut scored = if widened {
             for (channel, gradient) in scratch.edge_gradient.iter().enumerate() {
                 step.edge[channel] = load(gradient, start, count);
             }
-        }
+            step.score::<true>(rules)
+        } else {
+            step.score::<false>(rules)
+        };
+        let two = step.settle(&mut scored, rules);
         let surprise = &mut surprise[start..start + count];
         let posterior = &mut posterior[start..start + count];
-        let scored = step.score(rules);
-        for lane in 0..count {
-            (surprise[lane], posterior[lane]) = step.settle(&scored, lane, row, start, rules);
+        match posterior.first_chunk_mut::<LANES>() {
+            Some(records) => Record::pack_lanes(&scored.posterior, records),
+            None => {
+                let mut records = [Record::default(); LANES];
+                Record::pack_lanes(&scored.posterior, &mut records);
+                posterior.copy_from_slice(&records[..count]);
+            }
+        }
+        surprise.copy_from_slice(&scored.surprise[..count]);
+        for lane in members(two).take_while(|&lane| lane < count) {
+            (surprise[lane], posterior[lane]) =
+                two_appearances(&step, &scored, lane, row.belief(start + lane), rules);
         }
     }
 }
@@ -113,11 +126,14 @@ fn load(plane: &[f32], start: usize, count: usize) -> Lanes {
 }
 
 /// Sixteen pixels on their way through the update.
+#[derive(Default)]
 struct Step {
     alpha: Lanes,
     beta: [Lanes; CHANNELS],
     tau: [Lanes; CHANNELS],
     sigma: [Lanes; CHANNELS],
+    p2: Lanes,
+    coverage: Lanes,
     observed: [Lanes; CHANNELS],
     /// Squared gradient of tau; 0 unless edges are widened.
     edge: [Lanes; CHANNELS],
@@ -128,9 +144,7 @@ struct Scored {
     surprise: Lanes,
     /// The prior's beta as scored: with the variance of edges.
     widened_beta: [Lanes; CHANNELS],
-    beta: [Lanes; CHANNELS],
-    tau: [Lanes; CHANNELS],
-    sigma: [Lanes; CHANNELS],
+    posterior: BeliefLanes,
 }
 
 impl Step {
@@ -142,116 +156,116 @@ impl Step {
         start: usize,
         count: usize,
     ) -> Self {
-        let channels = |plane: usize| -> [Lanes; CHANNELS] {
-            std::array::from_fn(|channel| load(row.plane(plane + channel), start, count))
-        };
-        Self {
+        let mut step = Self {
             alpha: load(row.plane(prior::ALPHA), start, count),
-            beta: channels(prior::BETA),
-            tau: channels(prior::TAU),
-            sigma: channels(prior::SIGMA),
-            observed: observed.map(|plane| load(plane, start, count).map(|x| x * inverse_gain)),
-            edge: [[0.0; LANES]; CHANNELS],
+            p2: load(row.plane(prior::P2), start, count),
+            coverage: load(row.plane(prior::COVERAGE), start, count),
+            ..Self::default()
+        };
+        for c in 0..CHANNELS {
+            step.beta[c] = load(row.plane(prior::BETA + c), start, count);
+            step.tau[c] = load(row.plane(prior::TAU + c), start, count);
+            step.sigma[c] = load(row.plane(prior::SIGMA + c), start, count);
+            step.observed[c] = load(observed[c], start, count);
+            for observed in &mut step.observed[c] {
+                *observed *= inverse_gain;
+            }
         }
+        for plane in 0..prior::TAU2 {
+            // The next row of the same planes.
+            prefetch(row.data, row.width * (prior::PLANES + plane) + start);
+        }
+        step
     }
 
     #[inline(always)]
-    fn score(&self, rules: &ScoreRules) -> Scored {
+    fn score<const WIDENED: bool>(&self, rules: &ScoreRules) -> Scored {
         let mut scored = Scored {
             surprise: [0.0; LANES],
             widened_beta: self.beta,
-            beta: [[0.0; LANES]; CHANNELS],
-            tau: [[0.0; LANES]; CHANNELS],
-            sigma: [[0.0; LANES]; CHANNELS],
+            posterior: BeliefLanes::default(),
         };
         let mut plain = [0.0; LANES];
-        let mut beta_ratios = [1.0; LANES];
-        let mut sigma_ratios = [1.0; LANES];
+        let mut before = [[1.0; LANES]; 2];
+        let mut after = [[1.0; LANES]; 2];
         for c in 0..CHANNELS {
             for lane in 0..LANES {
                 let alpha0 = self.alpha[lane];
                 let (tau0, sigma0) = (self.tau[c][lane], self.sigma[c][lane]);
                 let observed = self.observed[c][lane];
-                let prior = (self.beta[c][lane], tau0, sigma0);
-                let (beta, tau, sigma) = rules.update.channel(alpha0, prior, observed);
-                scored.beta[c][lane] = beta;
-                scored.tau[c][lane] = tau;
-                scored.sigma[c][lane] = sigma;
-            }
-            for lane in 0..LANES {
-                let alpha0 = self.alpha[lane];
-                let widened =
-                    self.beta[c][lane] + alpha0 * rules.edge_variance_px * self.edge[c][lane];
-                scored.widened_beta[c][lane] = widened;
-                let (tau0, sigma0) = (self.tau[c][lane], self.sigma[c][lane]);
-                let observed = self.observed[c][lane];
-                let (beta, _, sigma) =
+                let beta0 = self.beta[c][lane];
+                let (beta, tau, sigma) =
                     rules
                         .update
-                        .channel(alpha0, (widened, tau0, sigma0), observed);
-                let (p, b, s) = channel_terms(
+                        .channel(alpha0, (beta0, tau0, sigma0), observed);
+                scored.posterior.beta[c][lane] = beta;
+                scored.posterior.tau[c][lane] = tau;
+                scored.posterior.sigma[c][lane] = sigma;
+                let (beta0, beta, sigma) = if WIDENED {
+                    let widened = beta0 + alpha0 * rules.edge_variance_px * self.edge[c][lane];
+                    scored.widened_beta[c][lane] = widened;
+                    let (beta, _, sigma) =
+                        rules
+                            .update
+                            .channel(alpha0, (widened, tau0, sigma0), observed);
+                    (widened, beta, sigma)
+                } else {
+                    (beta0, beta, sigma)
+                };
+                plain[lane] += plain_terms(
                     rules.update.alpha(alpha0),
-                    (widened, sigma0),
+                    (beta0, sigma0),
                     (beta, sigma),
                     observed - tau0,
                 );
-                plain[lane] += p;
-                beta_ratios[lane] *= b;
-                sigma_ratios[lane] *= s;
+                before[0][lane] *= beta0;
+                before[1][lane] *= sigma0;
+                after[0][lane] *= beta;
+                after[1][lane] *= sigma;
             }
         }
         for lane in 0..LANES {
+            scored.posterior.alpha[lane] = rules.update.alpha(self.alpha[lane]);
             scored.surprise[lane] = total(
                 self.alpha[lane],
                 plain[lane],
-                beta_ratios[lane],
-                sigma_ratios[lane],
+                (before[0][lane], before[1][lane]),
+                (after[0][lane], after[1][lane]),
                 &rules.gamma,
             );
         }
         scored
     }
 
-    /// One pixel's surprise and record.
+    /// What is particular to unseen pixels; returns those, a bit mask, that have an earlier appearance or get one.
     #[inline(always)]
-    fn settle(
-        &self,
-        scored: &Scored,
-        lane: usize,
-        row: PriorRow,
-        start: usize,
-        rules: &ScoreRules,
-    ) -> (f32, Record) {
-        let x = start + lane;
-        let observed = self.observed.map(|plane| plane[lane]);
-        let unseen = row.plane(prior::COVERAGE)[x] == 0.0;
-        if unseen && rules.update.unseen_start == UnseenStart::Observation {
-            return (0.0, Record::pack(&rules.update.start(observed)));
-        }
-        let mut posterior = Belief {
-            alpha: rules.update.alpha(self.alpha[lane]),
-            beta: scored.beta.map(|plane| plane[lane]),
-            tau: scored.tau.map(|plane| plane[lane]),
-            sigma: scored.sigma.map(|plane| plane[lane]),
-            ..Belief::default()
-        };
-        if unseen {
-            return (0.0, Record::pack(&posterior));
-        }
-        let mut surprise = scored.surprise[lane];
-        if rules.earlier_appearance {
-            let p2 = row.plane(prior::P2)[x];
-            if p2 > P2_MIN || surprise > rules.surprise_threshold {
-                let stored = row.belief(x);
-                let widened = Belief {
-                    beta: scored.widened_beta.map(|plane| plane[lane]),
-                    ..stored
-                };
-                surprise =
-                    two_appearances(&stored, &widened, observed, surprise, &mut posterior, rules);
+    fn settle(&self, scored: &mut Scored, rules: &ScoreRules) -> u32 {
+        let starts = rules.update.unseen_start == UnseenStart::Observation;
+        let start = rules.update.start([0.0; CHANNELS]);
+        let Scored {
+            surprise,
+            posterior,
+            ..
+        } = scored;
+        for lane in 0..LANES {
+            let unseen = self.coverage[lane] == 0.0;
+            surprise[lane] = if unseen { 0.0 } else { surprise[lane] };
+            let starts = unseen & starts;
+            let or = |value: f32, start: f32| if starts { start } else { value };
+            posterior.alpha[lane] = or(posterior.alpha[lane], start.alpha);
+            for c in 0..CHANNELS {
+                posterior.beta[c][lane] = or(posterior.beta[c][lane], start.beta[c]);
+                posterior.tau[c][lane] = or(posterior.tau[c][lane], self.observed[c][lane]);
+                posterior.sigma[c][lane] = or(posterior.sigma[c][lane], start.sigma[c]);
             }
         }
-        (surprise, Record::pack(&posterior))
+        if !rules.earlier_appearance {
+            return 0;
+        }
+        bits(|lane| {
+            (self.coverage[lane] > 0.0)
+                & ((self.p2[lane] > P2_MIN) | (surprise[lane] > rules.surprise_threshold))
+        })
     }
 }
 
@@ -259,15 +273,21 @@ impl Step {
 /// posterior remembers.
 #[cold]
 fn two_appearances(
-    stored: &Belief,
-    widened: &Belief,
-    observed: [f32; CHANNELS],
-    surprise1: f32,
-    posterior: &mut Belief,
+    step: &Step,
+    scored: &Scored,
+    lane: usize,
+    stored: Belief,
     rules: &ScoreRules,
-) -> f32 {
+) -> (f32, Record) {
+    let observed = step.observed.map(|plane| plane[lane]);
+    let widened = Belief {
+        beta: scored.widened_beta.map(|plane| plane[lane]),
+        ..stored
+    };
+    let surprise1 = scored.surprise[lane];
+    let mut posterior = scored.posterior.at(lane);
     let (surprise, rho2) = if stored.p2 > P2_MIN {
-        joint_surprise(widened, observed, surprise1, &rules.update, &rules.gamma)
+        joint_surprise(&widened, observed, surprise1, &rules.update, &rules.gamma)
     } else {
         (surprise1, 0.0)
     };
@@ -284,7 +304,7 @@ fn two_appearances(
             p2,
         }
     };
-    *posterior = if rho2 > 0.5 {
+    posterior = if rho2 > 0.5 {
         // What was there before is back: the two change places.
         let tau = std::array::from_fn(|c| (observed[c] + stored.tau2[c]) / 2.0);
         changed(tau, 0.5 * (1.0 - stored.p2))
@@ -294,11 +314,11 @@ fn two_appearances(
         Belief {
             tau2: stored.tau2,
             p2: 0.5 * stored.p2 + 0.5 * rho2,
-            ..*posterior
+            ..posterior
         }
     };
     if posterior.p2 < P2_MIN {
         posterior.p2 = 0.0;
     }
-    surprise
+    (surprise, Record::pack(&posterior))
 }

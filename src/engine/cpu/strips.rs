@@ -1,23 +1,17 @@
 //! The recall passes over one strip of rows: every view's mesh is drawn into a map, then the rows are merged.
 
 use crate::{
-    engine::isa::{Isa, for_each_isa},
+    isa::{Isa, for_each_isa},
     stages::interpolate::{
+        gather::Portable,
         merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
         prior::PLANES,
-        project::{ProjectScratch, Projector, Sample},
+        project::{ProjectScratch, Projector, Sample, draw},
     },
 };
 
-for_each_isa! {
-    fn draw(
-        projector: &Projector<'_>,
-        width: usize,
-        rows: std::ops::Range<usize>,
-        map: &mut [Sample],
-        scratch: &mut ProjectScratch,
-    ) = draw_kernel;
-}
+#[cfg(target_arch = "x86_64")]
+use crate::stages::interpolate::gather::Avx;
 
 for_each_isa! {
     fn merge(
@@ -26,18 +20,7 @@ for_each_isa! {
         rules: MergeRules,
         width: usize,
         row: &mut [f32],
-    ) = merge_row;
-}
-
-#[inline(always)]
-fn draw_kernel(
-    projector: &Projector<'_>,
-    width: usize,
-    rows: std::ops::Range<usize>,
-    map: &mut [Sample],
-    scratch: &mut ProjectScratch,
-) {
-    projector.draw(width, rows, map, scratch);
+    ) = merge_row::<Portable>, avx merge_row::<Avx>;
 }
 
 /// Working memory of one thread.

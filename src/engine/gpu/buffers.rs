@@ -10,7 +10,10 @@ use super::{
     residency::{BYTES_PER_PIXEL, Place, Residency},
 };
 use crate::{
-    model::{belief::Record, viewpoint::Viewpoint},
+    model::{
+        belief::Record,
+        viewpoint::{Mesh, Viewpoint},
+    },
     stages::interpolate::merge::VIEWS_MAX,
 };
 
@@ -122,14 +125,23 @@ impl Arenas {
         place
     }
 
-    /// Returns how many bytes went up.
-    pub fn upload_depth(&self, device: &Device, first: u64, depth_m: &[f32]) -> u64 {
+    /// Which triangles of a pixel's quad exist goes into the two lowest bits of its depth, which moves it by less than
+    /// 4e-7 of itself. Returns how many bytes went up.
+    pub fn upload_mesh(&self, device: &Device, first: u64, mesh: &Mesh) -> u64 {
+        let width = mesh.intrinsics.width;
+        let mut words: Vec<u32> = mesh.depth_m.iter().map(|z| z.to_bits() & !3).collect();
+        let quads = mesh.cut.chunks_exact((width - 1).max(1));
+        for (words, quads) in words.chunks_exact_mut(width).zip(quads) {
+            for (word, quad) in words.iter_mut().zip(quads) {
+                *word |= u32::from(*quad);
+            }
+        }
         device.upload(
             &self.depth,
             DEPTH_BYTES * first,
-            bytemuck::cast_slice(depth_m),
+            bytemuck::cast_slice(&words),
         );
-        size_of_val(depth_m) as u64
+        size_of_val(words.as_slice()) as u64
     }
 
     pub fn upload_records(&self, device: &Device, first: u64, records: &[Record]) -> u64 {

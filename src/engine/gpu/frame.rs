@@ -271,7 +271,7 @@ impl State {
         if let Some(Place::Empty(first)) = self.arenas.place(&self.device, viewpoint) {
             counters.uploaded_bytes +=
                 self.arenas
-                    .upload_depth(&self.device, first, &viewpoint.mesh.depth_m);
+                    .upload_mesh(&self.device, first, &viewpoint.mesh);
             let mut passes = Passes::new(&self.device, None, "remember");
             passes.copy(
                 &buffers.posterior_records,
@@ -327,10 +327,10 @@ impl State {
                     Place::Held(first) => first,
                     Place::Empty(first) => {
                         let viewpoint = view.viewpoint;
-                        let depth_m = &viewpoint.mesh.depth_m;
                         counters.views_brought += 1;
                         counters.uploaded_bytes +=
-                            self.arenas.upload_depth(&self.device, first, depth_m)
+                            self.arenas
+                                .upload_mesh(&self.device, first, &viewpoint.mesh)
                                 + self.arenas.upload_records(
                                     &self.device,
                                     first,

@@ -70,7 +70,7 @@ impl View {
         fresh: bool,
     ) -> Self {
         let (h_matrix, h_offset) = homography(
-            &viewpoint.mesh.intrinsics,
+            &viewpoint.mesh,
             &viewpoint.world_from_camera,
             intrinsics,
             world_from_camera,
@@ -110,7 +110,6 @@ pub struct Rules {
     pub edge_variance_px: f32,
     pub surprise_threshold: f32,
     pub depth_vote_tolerance: f32,
-    pub mesh_cut: f32,
     pub gamma_center: f32,
     pub gamma_scale: f32,
     pub second_look: u32,
@@ -120,7 +119,7 @@ pub struct Rules {
     pub view_variance: u32,
     pub earlier_appearance: u32,
     pub exposure_gain: u32,
-    _padding: [u32; 2],
+    _padding: [u32; 3],
     /// Lowest power first, padded with zeros.
     pub gamma_coefficients: [[f32; 4]; 4],
 }
@@ -141,7 +140,6 @@ impl Rules {
             edge_variance_px: settings.edge_error_px * settings.edge_error_px,
             surprise_threshold: settings.surprise_threshold,
             depth_vote_tolerance: settings.depth_vote_tolerance,
-            mesh_cut: settings.mesh_cut,
             gamma_center: gamma.center,
             gamma_scale: gamma.scale,
             second_look: settings.second_look.into(),
@@ -151,7 +149,7 @@ impl Rules {
             view_variance: settings.view_variance.into(),
             earlier_appearance: settings.earlier_appearance.into(),
             exposure_gain: settings.exposure_gain.into(),
-            _padding: [0; 2],
+            _padding: [0; 3],
             gamma_coefficients,
         }
     }

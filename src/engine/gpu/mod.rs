@@ -48,12 +48,12 @@ use self::{
     layout::Rules,
 };
 use super::{
-    Compared, EngineError, Question, compare_on_processor,
+    Answer, Compared, EngineError, Question, compare_on_processor,
     cpu::{CpuEngine, RecallView, Score},
-    isa::Isa,
 };
 use crate::{
     config::Settings,
+    isa::Isa,
     model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
     stages::interpolate::prior::Prior,
 };
@@ -131,6 +131,10 @@ impl GpuEngine {
         self.adapters == Adapters::Real
     }
 
+    pub(super) fn processor(&self) -> &CpuEngine {
+        &self.processor
+    }
+
     /// The engine that takes over.
     pub(super) fn fallback(&self) -> CpuEngine {
         CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
@@ -145,8 +149,7 @@ impl GpuEngine {
         &mut self,
         question: &Question,
         learn: bool,
-        prior: &mut Prior,
-        score: &mut Score,
+        answer: &mut Answer,
     ) -> Result<Compared, EngineError> {
         let wanted = Wanted {
             evidence: self.settings.evidence,
@@ -161,7 +164,7 @@ impl GpuEngine {
                 question.world_from_camera,
                 question.image,
                 wanted,
-                score,
+                answer.score,
                 counters,
             )
         })?;
@@ -172,12 +175,11 @@ impl GpuEngine {
                 &self.processor,
                 question,
                 evidence,
-                prior,
-                score,
+                answer,
             ));
         };
+        *answer.evidence = report.evidence;
         Ok(Compared {
-            evidence: report.evidence,
             seen: report.seen,
             maps_read: false,
         })

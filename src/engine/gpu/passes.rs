@@ -95,7 +95,6 @@ const ATTEND: &str = shader!("layout.wgsl", "attend.wgsl", "passes/attend.wgsl")
 
 const DRAWN: &[(u32, Slot)] = &[
     (0, Slot::Frame),
-    (1, Slot::Rules),
     (2, Slot::Views),
     (3, Slot::DepthArena),
     (4, Slot::Nearest),

@@ -18,7 +18,7 @@ use super::{
     lanes::{Lanes, for_each_isa},
     messages::{self, ABOVE, BELOW, Belief, LEFT, RIGHT, Sender},
 };
-use crate::engine::isa::Isa;
+use crate::isa::Isa;
 use rayon::prelude::*;
 use std::ops::Range;
 

@@ -7,7 +7,7 @@
 ///
 /// # Safety
 /// Every method may execute instructions of the implementing type's instruction set: call them only where
-/// [`Isa`](crate::engine::isa::Isa) says that the processor has it.
+/// [`Isa`](crate::isa::Isa) says that the processor has it.
 pub unsafe trait Lanes: Copy {
     const N: usize;
 
@@ -228,8 +228,8 @@ macro_rules! for_each_isa {
     ($(#[$doc:meta])* $vis:vis unsafe fn $name:ident = $kernel:ident($($arg:ident: $ty:ty),* $(,)?)) => {
         $(#[$doc])*
         #[allow(unused_unsafe, clippy::too_many_arguments, reason = "some kernels are safe code; arguments are passed on")]
-        $vis unsafe fn $name(isa: $crate::engine::isa::Isa, $($arg: $ty),*) {
-            use $crate::engine::isa::Isa;
+        $vis unsafe fn $name(isa: $crate::isa::Isa, $($arg: $ty),*) {
+            use $crate::isa::Isa;
             use $crate::stages::depth::lanes;
 
             #[cfg(target_arch = "x86_64")]

@@ -2,7 +2,7 @@
 //! Vectors run over pixels and the loop over labels, so that the minimum over labels needs no shuffle.
 
 use super::lanes::{Lanes, for_each_isa};
-use crate::engine::isa::Isa;
+use crate::isa::Isa;
 use std::mem::MaybeUninit;
 
 /// Neighbours in the order of the message planes. A message sent towards `k` is received as from `3 - k`. Those that

@@ -2,19 +2,23 @@
 //! In: luminance of the middle, left and right camera, the rig. Out: depth of the middle image, metres.
 //! Open in the paper: see [`plane_sweep`], [`belief_propagation`] and [`refine`], in this order.
 
+pub mod given;
+
 mod belief_propagation;
 mod checkerboard;
 mod lanes;
 mod messages;
 mod plane_sweep;
 mod refine;
+mod sides;
 
 pub use belief_propagation::{BeliefPropagation, Contrast, PropagationSettings, Smoothness};
 pub use checkerboard::{CostRow, CostVolume};
 pub use messages::Belief;
 pub use plane_sweep::{DepthRig, InverseDepthRange, SideCamera, SweepSettings};
+pub use sides::SidesDepth;
 
-use crate::engine::isa::Isa;
+use crate::isa::Isa;
 use plane_sweep::{Middle, Side, Sweep};
 use rayon::prelude::*;
 

@@ -16,7 +16,7 @@ use super::{
     messages::Belief,
 };
 use crate::{
-    engine::isa::Isa,
+    isa::Isa,
     model::{camera::Intrinsics, pose::Pose},
 };
 use nalgebra::{Matrix3, Vector3};

@@ -5,11 +5,15 @@
 //! this visit count little, disagreement adds to the variance, and what the outvoted remember becomes the earlier
 //! appearance. Each of these is a switch.
 
-use crate::model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16};
+use crate::{
+    lanes::{LANES, Lanes, bits, members, prefetch},
+    model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
+};
 
 use super::{
+    gather::{Gather, GatherView, LEVEL_UNITS, Source, Sums},
     prior,
-    project::{Sample, sample_depth_m, sample_position},
+    project::Sample,
 };
 
 /// As [`crate::config::Settings::views`] allows.
@@ -33,6 +37,16 @@ pub struct MergeRules {
     pub colour_vote: bool,
     pub view_variance: bool,
     pub earlier_appearance: bool,
+}
+
+impl MergeRules {
+    /// Whether a view's values are held against the others'.
+    fn compares(&self) -> bool {
+        self.depth_vote_tolerance.is_some()
+            || self.colour_vote
+            || self.view_variance
+            || self.earlier_appearance
+    }
 }
 
 /// A view to gather from.
@@ -81,7 +95,7 @@ impl Gathered {
 /// Merges one row of the target. `maps[i]` is the row of the map of `views[i]`; `row` takes [`prior::PLANES`] planes of
 /// `width`.
 #[inline(always)]
-pub fn merge_row(
+pub fn merge_row<G: Gather>(
     views: &[MergeView],
     maps: &[&[Sample]],
     rules: MergeRules,
@@ -89,61 +103,209 @@ pub fn merge_row(
     row: &mut [f32],
 ) {
     assert!(views.len() <= VIEWS_MAX && views.len() == maps.len());
+    // A smaller view has no triangle.
+    let has_triangles = |view: &MergeView| view.width >= 2 && view.height >= 2;
+    let comparing = rules.compares() || views.iter().any(|view| view.weight != 1.0);
+    let mut gather_views = [GatherView {
+        records: &[],
+        width: 0,
+        weight: 0.0,
+    }; VIEWS_MAX];
+    for (gather_view, view) in gather_views.iter_mut().zip(views) {
+        *gather_view = GatherView {
+            records: view.records,
+            width: view.width,
+            weight: view.weight,
+        };
+    }
+    let gather_views = &gather_views[..views.len()];
+    let mut sources = [Source::NONE; VIEWS_MAX];
+    let mut sums = Sums::ZERO;
     let mut pixel = Pixel::default();
-    for x in 0..width {
-        pixel.clear();
-        for (view, map) in views.iter().zip(maps) {
-            let sample = map[x];
-            if sample != 0 {
-                pixel.push(sample_depth_m(sample), gather(view, sample), view);
+    for start in (0..width).step_by(LANES) {
+        let count = LANES.min(width - start);
+        let mut step = Step::default();
+        for (index, (view, map)) in views.iter().zip(maps).enumerate() {
+            if has_triangles(view) {
+                let mut padded = [0; LANES];
+                let samples = match map[start..].first_chunk::<LANES>() {
+                    Some(samples) => samples,
+                    None => {
+                        padded[..count].copy_from_slice(&map[start..start + count]);
+                        &padded
+                    }
+                };
+                let source = &mut sources[index];
+                for lane in 0..LANES {
+                    source.locate(lane, samples[lane], view.width as u32, view.height as u32);
+                    step.see(lane, index, view.weight, source.inverse_depth[lane]);
+                }
+                source.prefetch_below(&gather_views[index]);
             }
         }
-        if pixel.count == 0 {
-            prior::put(row, width, x, &UNSEEN, 0.0, 0.0);
-            continue;
-        }
-        let mut kept = (1u32 << pixel.count) - 1;
+        let mut apart = 0;
         if let Some(tolerance) = rules.depth_vote_tolerance {
-            kept = pixel.vote_on_depth(tolerance);
+            apart = step.depths_apart(tolerance);
         }
-        if rules.colour_vote {
-            kept = pixel.vote_on_colour(kept);
+        for lane in members(apart) {
+            step.seen[lane] = 0;
         }
-        let mut belief = pixel.mean(kept, rules.view_variance);
-        if rules.earlier_appearance {
-            (belief.tau2, belief.p2) = pixel.earlier_appearance(kept);
+        if comparing {
+            G::sum::<true>(gather_views, &sources, &step.seen, &mut sums);
+            let mut merged = step.finish(&sums, true, rules.view_variance);
+            if rules.colour_vote {
+                apart |= merged.colours_apart(&sums);
+            }
+            if rules.earlier_appearance {
+                apart |= merged.remembering();
+            }
+            merged.write(row, width, start, count);
+        } else {
+            G::sum::<false>(gather_views, &sources, &step.seen, &mut sums);
+            step.finish(&sums, false, false)
+                .write(row, width, start, count);
         }
-        let depth_m = pixel.mean_depth_m(kept);
-        prior::put(row, width, x, &belief, depth_m, pixel.count as f32);
+        for lane in members(apart).take_while(|&lane| lane < count) {
+            pixel.clear();
+            for (view, (gather_view, source)) in views.iter().zip(gather_views.iter().zip(&sources))
+            {
+                if source.inverse_depth[lane] > 0.0 {
+                    pixel.push(
+                        1.0 / source.inverse_depth[lane],
+                        interpolate(gather_view, source, lane),
+                        view,
+                    );
+                }
+            }
+            let (belief, depth_m) = pixel.merge(rules);
+            prior::put(
+                row,
+                width,
+                start + lane,
+                &belief,
+                depth_m,
+                pixel.count as f32,
+            );
+        }
     }
 }
 
-/// Interpolates the three records of the triangle around a sample.
+/// What is known of sixteen pixels before their records are fetched.
+#[derive(Default)]
+struct Step {
+    /// Views that see a pixel, a bit mask.
+    seen: [u32; LANES],
+    coverage: Lanes,
+    weight: Lanes,
+    weighted_depth_m: Lanes,
+    /// Of the views' inverse depths; 0 where unseen.
+    nearest: Lanes,
+    farthest: Lanes,
+}
+
+impl Step {
+    #[inline(always)]
+    fn see(&mut self, lane: usize, index: usize, weight: f32, inverse_depth: f32) {
+        let seen = inverse_depth > 0.0;
+        self.seen[lane] |= u32::from(seen) << index;
+        self.coverage[lane] += if seen { 1.0 } else { 0.0 };
+        self.weight[lane] += if seen { weight } else { 0.0 };
+        self.weighted_depth_m[lane] += if seen { weight / inverse_depth } else { 0.0 };
+        let nearest = self.nearest[lane];
+        self.nearest[lane] = if inverse_depth > nearest {
+            inverse_depth
+        } else {
+            nearest
+        };
+        let farthest = self.farthest[lane];
+        let farther = seen & ((inverse_depth < farthest) | (farthest == 0.0));
+        self.farthest[lane] = if farther { inverse_depth } else { farthest };
+    }
+
+    /// Pixels, a bit mask, whose views must vote on depth: the farthest is not within the tolerance of the nearest.
+    #[inline(always)]
+    fn depths_apart(&self, tolerance: f32) -> u32 {
+        bits(|lane| self.nearest[lane] - self.farthest[lane] > tolerance * self.farthest[lane])
+    }
+
+    /// Weighted means of all that was summed; with `view_variance` beta grows by alpha times their variance in tau.
+    #[inline(always)]
+    fn finish(&self, sums: &Sums, comparing: bool, view_variance: bool) -> Merged {
+        let mut merged = Merged([[0.0; LANES]; prior::PLANES]);
+        let planes = &mut merged.0;
+        for lane in 0..LANES {
+            let seen = self.coverage[lane] > 0.0;
+            let scale = if seen { 1.0 / self.weight[lane] } else { 0.0 };
+            let or = |value: f32, unseen: f32| if seen { value } else { unseen };
+            let alpha = sums.spread[0][lane] * scale;
+            planes[prior::ALPHA][lane] = or(alpha, UNSEEN.alpha);
+            for c in 0..CHANNELS {
+                let mean = sums.level[c][lane] * scale;
+                let mut beta = sums.spread[1 + c][lane] * scale;
+                let mut level = mean;
+                if comparing {
+                    level += sums.range[c][lane];
+                    if view_variance {
+                        let square = sums.level[4 + c][lane] * scale - mean * mean;
+                        let variance = if square > 0.0 { square } else { 0.0 };
+                        beta += alpha * (variance * (1.0 / (LEVEL_UNITS * LEVEL_UNITS)));
+                    }
+                }
+                let tau = level * (1.0 / LEVEL_UNITS) + LEVEL_OFFSET[c];
+                planes[prior::BETA + c][lane] = or(beta, UNSEEN.beta[c]);
+                planes[prior::TAU + c][lane] = or(tau, UNSEEN.tau[c]);
+                planes[prior::SIGMA + c][lane] =
+                    or(sums.spread[4 + c][lane] * scale, UNSEEN.sigma[c]);
+            }
+            // Where there is something to remember it is replaced.
+            planes[prior::P2][lane] = or(sums.spread[7][lane], 0.0);
+            planes[prior::DEPTH][lane] = self.weighted_depth_m[lane] * scale;
+            planes[prior::COVERAGE][lane] = self.coverage[lane];
+        }
+        merged
+    }
+}
+
+/// Sixteen pixels of the prior.
+struct Merged([Lanes; prior::PLANES]);
+
+impl Merged {
+    /// Pixels, a bit mask, whose views must vote on colour.
+    #[inline(always)]
+    fn colours_apart(&self, sums: &Sums) -> u32 {
+        let [_, _, _, _, y, cb, cr, _] = &sums.range;
+        bits(|lane| {
+            (y[lane] + cb[lane] + cr[lane] > COLOUR_CONFLICT * LEVEL_UNITS)
+                & (self.0[prior::COVERAGE][lane] > 1.0)
+        })
+    }
+
+    /// Pixels, a bit mask, for which some view remembers an earlier appearance.
+    #[inline(always)]
+    fn remembering(&self) -> u32 {
+        bits(|lane| self.0[prior::P2][lane] > 0.0)
+    }
+
+    #[inline(always)]
+    fn write(&mut self, row: &mut [f32], width: usize, start: usize, count: usize) {
+        self.0[prior::P2] = [0.0; LANES];
+        for (index, lanes) in self.0.iter().enumerate() {
+            // The next row of the same planes.
+            prefetch(row, width * (prior::PLANES + index) + start);
+            let plane = &mut row[width * index..][..width];
+            match plane[start..].first_chunk_mut() {
+                Some(slot) => *slot = *lanes,
+                None => plane[start..].copy_from_slice(&lanes[..count]),
+            }
+        }
+    }
+}
+
+/// Interpolates the three records of a lane's triangle.
 #[inline(always)]
-fn gather(view: &MergeView, sample: Sample) -> Gathered {
-    let (column, row, mut right, mut down) = sample_position(sample);
-    // A sample on the last column or row belongs to the quad before it.
-    let last_column = view.width - 2;
-    let last_row = view.height - 2;
-    right += if column > last_column { 1.0 } else { 0.0 };
-    down += if row > last_row { 1.0 } else { 0.0 };
-    let upper_left = row.min(last_row) * view.width + column.min(last_column);
-    let upper_right = upper_left + 1;
-    let lower_left = upper_left + view.width;
-    let in_upper_left = right + down <= 1.0;
-    let (corner, w) = if in_upper_left {
-        (upper_left, [1.0 - right - down, right, down])
-    } else {
-        (
-            lower_left + 1,
-            [right + down - 1.0, 1.0 - down, 1.0 - right],
-        )
-    };
-    let records = [
-        &view.records[corner],
-        &view.records[upper_right],
-        &view.records[lower_left],
-    ];
+fn interpolate(view: &GatherView, source: &Source, lane: usize) -> Gathered {
+    let records = source.records(lane, view);
+    let w = source.weights.map(|weights| weights[lane]);
     let mut gathered = Gathered {
         spread: [0.0; 8],
         level: LEVEL_OFFSET,
@@ -193,6 +355,22 @@ impl Pixel {
         self.fresh |= u32::from(view.fresh) << index;
         self.gathered[index] = gathered;
         self.count += 1;
+    }
+
+    /// Belief and depth, metres, of a pixel that some view sees.
+    fn merge(&self, rules: MergeRules) -> (Belief, f32) {
+        let mut kept = self.all();
+        if let Some(tolerance) = rules.depth_vote_tolerance {
+            kept = self.vote_on_depth(tolerance);
+        }
+        if rules.colour_vote {
+            kept = self.vote_on_colour(kept);
+        }
+        let mut belief = self.mean(kept, rules.view_variance);
+        if rules.earlier_appearance {
+            (belief.tau2, belief.p2) = self.earlier_appearance(kept);
+        }
+        (belief, self.mean_depth_m(kept))
     }
 
     fn all(&self) -> u32 {
@@ -366,18 +544,6 @@ impl Pixel {
         let all: f32 = members(witnesses).map(|index| self.weight[index]).sum();
         (tau2.map(|sum| sum / weight), (weight / all).min(P2_MAX))
     }
-}
-
-/// Indices of the set bits, ascending.
-#[inline(always)]
-fn members(mut set: u32) -> impl Iterator<Item = usize> {
-    std::iter::from_fn(move || {
-        (set != 0).then(|| {
-            let index = set.trailing_zeros() as usize;
-            set &= set - 1;
-            index
-        })
-    })
 }
 
 fn distance(a: [f32; CHANNELS], b: [f32; CHANNELS]) -> f32 {

@@ -4,6 +4,8 @@
 //! mesh is projected into a map of source positions ([`project`]), then records are gathered and merged ([`merge`]).
 //! The paper averages all covering views; the votes are ours and switchable.
 
+pub mod gather;
+
 pub mod merge;
 
 pub mod prior;

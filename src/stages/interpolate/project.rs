@@ -7,20 +7,21 @@ use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
 
+use crate::isa::for_each_isa;
+use crate::lanes::{LANES, Lanes, reciprocal};
 use crate::model::{
     camera::Intrinsics,
     pose::Pose,
     viewpoint::{LOWER_RIGHT, Mesh, UPPER_LEFT},
 };
-use crate::stages::lanes::{LANES, Lanes};
 
 /// A pixel of the map: `inverse depth (24 bit) | v (20 bit) | u (20 bit)`; 0 = the viewpoint does not see it.
 pub type Sample = u64;
 
 /// Steps of u and v per source pixel: half a step times the steepest edge stays below a grey level.
-const STEPS: f32 = 128.0;
-const POSITION_BITS: u32 = 20;
-const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
+pub const STEPS: f32 = 128.0;
+pub const POSITION_BITS: u32 = 20;
+pub const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
 /// The largest width and height that u and v can address.
 pub const SIDE_MAX: usize = 1 << (POSITION_BITS - 7);
 /// Of a positive `f32` the sign is 0 and 7 bits of the mantissa are left out: depth to 1.5e-5 of itself.
@@ -41,10 +42,16 @@ fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
         | steps(u)
 }
 
+/// 1/depth in the target camera, 1/metres.
+#[inline(always)]
+pub fn sample_inverse_depth(sample: Sample) -> f32 {
+    f32::from_bits(((sample >> (2 * POSITION_BITS)) as u32) << INVERSE_DEPTH_SHIFT)
+}
+
 /// Depth in the target camera, metres.
 #[inline(always)]
 pub fn sample_depth_m(sample: Sample) -> f32 {
-    1.0 / f32::from_bits(((sample >> (2 * POSITION_BITS)) as u32) << INVERSE_DEPTH_SHIFT)
+    1.0 / sample_inverse_depth(sample)
 }
 
 /// Whole and fractional source position: `(column, row, right, down)`.
@@ -69,25 +76,17 @@ pub struct Projector<'a> {
     mesh: &'a Mesh,
     h_matrix: Matrix3<f64>,
     h_offset: Vector3<f64>,
+    reach: &'a Reach,
 }
 
-/// H and h of [`Projector`].
-pub fn homography(
-    source: &Intrinsics,
-    world_from_view: &Pose,
-    target: &Intrinsics,
-    world_from_target: &Pose,
-) -> (Matrix3<f64>, Vector3<f64>) {
-    let target_from_view = world_from_target.inverse() * world_from_view;
-    let k = target.matrix();
-    let k_inverse = source
-        .matrix()
-        .try_inverse()
-        .expect("focal lengths are checked to be positive");
-    (
-        k * target_from_view.rotation.to_rotation_matrix().matrix() * k_inverse,
-        k * target_from_view.translation.vector,
-    )
+/// Which target rows the quads of a mesh can reach: least and greatest y, a block of sixteen quads each. Blocks without
+/// any have `(inf, -inf)`.
+#[derive(Default)]
+pub struct Reach {
+    low: Vec<f32>,
+    high: Vec<f32>,
+    /// Of each row's blocks together.
+    rows: Vec<(f32, f32)>,
 }
 
 /// One row of projected vertices.
@@ -106,19 +105,108 @@ pub struct ProjectScratch {
     lower: VertexRow,
 }
 
+/// Target from view, as [`Projector`] applies it.
+pub fn homography(
+    mesh: &Mesh,
+    world_from_view: &Pose,
+    target: &Intrinsics,
+    world_from_target: &Pose,
+) -> (Matrix3<f64>, Vector3<f64>) {
+    let target_from_view = world_from_target.inverse() * world_from_view;
+    let k = target.matrix();
+    let k_inverse = mesh
+        .intrinsics
+        .matrix()
+        .try_inverse()
+        .expect("focal lengths are checked to be positive");
+    (
+        k * target_from_view.rotation.to_rotation_matrix().matrix() * k_inverse,
+        k * target_from_view.translation.vector,
+    )
+}
+
+impl Reach {
+    /// Target y is monotonous in column and in depth, so the corners of a block's ranges bound it.
+    fn compute(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
+        let Intrinsics { width, height, .. } = mesh.intrinsics;
+        let blocks = mesh.blocks();
+        self.low.clear();
+        self.low.resize(blocks * height, 0.0);
+        self.high.clear();
+        self.high.resize(blocks * height, 0.0);
+        self.rows.clear();
+        let m = h_matrix.cast::<f32>();
+        let offset = h_offset.cast::<f32>();
+        for row in 0..height {
+            let start = (h_matrix * Vector3::new(0.0, row as f64, 1.0)).cast::<f32>();
+            let range = row * blocks..(row + 1) * blocks;
+            let nearest = &mesh.block_nearest_m[range.clone()];
+            let farthest = &mesh.block_farthest_m[range.clone()];
+            let lows = &mut self.low[range.clone()];
+            let highs = &mut self.high[range];
+            for block in 0..blocks {
+                let (mut low, mut high, mut least_z) =
+                    (f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY);
+                let first = (block * LANES) as f32;
+                for column in [first, min(first + LANES as f32, (width - 1) as f32)] {
+                    let ray_y = m[(1, 0)] * column + start.y;
+                    let ray_z = m[(2, 0)] * column + start.z;
+                    for z in [nearest[block], farthest[block]] {
+                        let q_z = z * ray_z + offset.z;
+                        let y = (z * ray_y + offset.y) / q_z;
+                        low = min(low, y);
+                        high = max(high, y);
+                        least_z = min(least_z, q_z);
+                    }
+                }
+                let empty = farthest[block] <= 0.0;
+                // What passes the camera plane has no bound. Slack for the rounding of single precision.
+                let unbounded = least_z < NEAR_M;
+                lows[block] = if empty {
+                    f32::INFINITY
+                } else if unbounded {
+                    f32::NEG_INFINITY
+                } else {
+                    low - 0.5
+                };
+                highs[block] = if empty {
+                    f32::NEG_INFINITY
+                } else if unbounded {
+                    f32::INFINITY
+                } else {
+                    high + 0.5
+                };
+            }
+        }
+        // A quad lies between two rows of vertices.
+        for row in 0..height.saturating_sub(1) {
+            let mut hull = (f32::INFINITY, f32::NEG_INFINITY);
+            for at in row * blocks..(row + 1) * blocks {
+                self.low[at] = min(self.low[at], self.low[at + blocks]);
+                self.high[at] = max(self.high[at], self.high[at + blocks]);
+                hull = (min(hull.0, self.low[at]), max(hull.1, self.high[at]));
+            }
+            self.rows.push(hull);
+        }
+    }
+}
+
 impl<'a> Projector<'a> {
+    /// `reach` is working memory.
     pub fn new(
         mesh: &'a Mesh,
         world_from_view: &Pose,
         target: &Intrinsics,
         world_from_target: &Pose,
+        reach: &'a mut Reach,
     ) -> Self {
-        let (h_matrix, h_offset) =
-            homography(&mesh.intrinsics, world_from_view, target, world_from_target);
+        let (h_matrix, h_offset) = homography(mesh, world_from_view, target, world_from_target);
+        reach.compute(mesh, &h_matrix, &h_offset);
         Self {
             mesh,
             h_matrix,
             h_offset,
+            reach,
         }
     }
 
@@ -132,63 +220,73 @@ impl<'a> Projector<'a> {
         map: &mut [Sample],
         scratch: &mut ProjectScratch,
     ) {
-        let rows = self.mesh.intrinsics.height;
-        let mut target = Target { width, strip, map };
+        assert_eq!(map.len(), width * strip.len(), "the map is the strip");
         let columns = self.mesh.intrinsics.width;
-        let mut lower_is = None;
-        for row in 0..rows.saturating_sub(1) {
-            let cut = &self.mesh.cut[row * (columns - 1)..][..columns - 1];
-            if !self.may_touch(row, &target.strip) {
+        let mut target = Target { width, strip, map };
+        // The row and columns that `lower` holds.
+        let mut held = (usize::MAX, 0..0);
+        let mut next = None;
+        for row in 0..self.reach.rows.len() {
+            let touched = match next.take() {
+                Some(touched) => touched,
+                None => self.touched(row, &target.strip),
+            };
+            if touched.is_empty() {
                 continue;
             }
-            if lower_is == Some(row) {
+            let below = if row + 1 < self.reach.rows.len() {
+                self.touched(row + 1, &target.strip)
+            } else {
+                0..0
+            };
+            if held.0 == row && held.1.start <= touched.start && touched.end <= held.1.end {
                 std::mem::swap(&mut scratch.upper, &mut scratch.lower);
             } else {
-                self.transform(row, &mut scratch.upper);
+                self.transform(row, touched.clone(), &mut scratch.upper);
             }
-            self.transform(row + 1, &mut scratch.lower);
-            lower_is = Some(row + 1);
+            let mut both = touched.clone();
+            if !below.is_empty() {
+                both = both.start.min(below.start)..both.end.max(below.end);
+            }
+            self.transform(row + 1, both.clone(), &mut scratch.lower);
+            held = (row + 1, both);
+            next = Some(below);
+            let cut = &self.mesh.cut[row * (columns - 1)..][..columns - 1];
             let quads = QuadRow {
                 row: row as f32,
                 upper: &scratch.upper,
                 lower: &scratch.lower,
                 cut,
             };
-            for column in (0..cut.len()).step_by(LANES) {
+            for column in touched.step_by(LANES) {
                 quads.draw_block(column, &mut target);
             }
         }
     }
 
-    /// Whether any quad between `row` and `row + 1` can reach the strip. Target y is monotonous in column and in depth,
-    /// so the corners of their ranges bound it.
-    fn may_touch(&self, row: usize, strip: &Range<usize>) -> bool {
-        let mut low = f64::INFINITY;
-        let mut high = f64::NEG_INFINITY;
-        for row in [row, row + 1] {
-            let (z_min, z_max) = self.mesh.row_depth_m[row];
-            if z_max <= 0.0 {
-                continue;
-            }
-            for column in [0, self.mesh.intrinsics.width - 1] {
-                let ray = self.h_matrix * Vector3::new(column as f64, row as f64, 1.0);
-                for z in [z_min, z_max] {
-                    let q = ray * f64::from(z) + self.h_offset;
-                    if q.z < f64::from(NEAR_M) {
-                        // It passes the camera plane: no bound.
-                        return true;
-                    }
-                    low = low.min(q.y / q.z);
-                    high = high.max(q.y / q.z);
-                }
-            }
+    /// The columns, whole blocks, from the first to the last whose quads below `row` can reach the strip.
+    #[inline(always)]
+    fn touched(&self, row: usize, strip: &Range<usize>) -> Range<usize> {
+        let (start, end) = (strip.start as f32, strip.end as f32);
+        let touches = |low: f32, high: f32| (low < end) & (high >= start);
+        let (low, high) = self.reach.rows[row];
+        if !touches(low, high) {
+            return 0..0;
         }
-        // One pixel of slack for the rounding of single precision.
-        low - 1.0 <= strip.end as f64 && high + 1.0 >= strip.start as f64
+        let blocks = self.mesh.blocks();
+        let low = &self.reach.low[row * blocks..][..blocks];
+        let high = &self.reach.high[row * blocks..][..blocks];
+        let touches = |block: &usize| touches(low[*block], high[*block]);
+        let first = (0..blocks).find(touches).unwrap_or(blocks);
+        let end = (first..blocks)
+            .rev()
+            .find(touches)
+            .map_or(first, |last| last + 1);
+        first * LANES..end * LANES
     }
 
     #[inline(always)]
-    fn transform(&self, row: usize, vertices: &mut VertexRow) {
+    fn transform(&self, row: usize, touched: Range<usize>, vertices: &mut VertexRow) {
         let columns = self.mesh.intrinsics.width;
         // A block of quads reads one vertex beyond its last.
         let padded = columns.next_multiple_of(LANES) + 1;
@@ -202,13 +300,15 @@ impl<'a> Projector<'a> {
         let m = self.h_matrix.cast::<f32>();
         let start = (self.h_matrix * Vector3::new(0.0, row as f64, 1.0)).cast::<f32>();
         let offset = self.h_offset.cast::<f32>();
-        let depth_m = &self.mesh.depth_m[row * columns..][..columns];
-        let xs = &mut vertices.x[..columns];
-        let ys = &mut vertices.y[..columns];
-        let inverse_depths = &mut vertices.inverse_depth[..columns];
-        for column in 0..columns {
+        // Quads need the vertex to their right.
+        let touched = touched.start..(touched.end + 1).min(columns);
+        let depth_m = &self.mesh.depth_m[row * columns..][touched.clone()];
+        let xs = &mut vertices.x[touched.clone()];
+        let ys = &mut vertices.y[touched.clone()];
+        let inverse_depths = &mut vertices.inverse_depth[touched.clone()];
+        for column in 0..depth_m.len() {
             let z = depth_m[column];
-            let at = column as f32;
+            let at = (touched.start + column) as f32;
             let q_x = z * (m[(0, 0)] * at + start.x) + offset.x;
             let q_y = z * (m[(1, 0)] * at + start.y) + offset.y;
             let q_z = z * (m[(2, 0)] * at + start.z) + offset.z;
@@ -219,6 +319,28 @@ impl<'a> Projector<'a> {
             inverse_depths[column] = inverse;
         }
     }
+}
+
+for_each_isa! {
+    /// [`Projector::draw`].
+    pub fn draw(
+        projector: &Projector<'_>,
+        width: usize,
+        rows: Range<usize>,
+        map: &mut [Sample],
+        scratch: &mut ProjectScratch,
+    ) = draw_kernel;
+}
+
+#[inline(always)]
+fn draw_kernel(
+    projector: &Projector<'_>,
+    width: usize,
+    rows: Range<usize>,
+    map: &mut [Sample],
+    scratch: &mut ProjectScratch,
+) {
+    projector.draw(width, rows, map, scratch);
 }
 
 /// Far outside any image, and small enough for [`floor`].
@@ -238,6 +360,13 @@ fn ceil(x: f32) -> f32 {
     -floor(-x)
 }
 
+/// A whole number of magnitude below 2^22.
+#[inline(always)]
+fn integer(x: f32) -> i32 {
+    const ROUND: f32 = 12_582_912.0;
+    (x + ROUND).to_bits() as i32 - ROUND.to_bits() as i32
+}
+
 /// A strip of the target image.
 struct Target<'a> {
     width: usize,
@@ -251,14 +380,6 @@ impl Target<'_> {
     fn put(&mut self, x: f32, y: f32, sample: Sample) {
         let slot = &mut self.map[(y as usize - self.strip.start) * self.width + x as usize];
         *slot = (*slot).max(sample);
-    }
-
-    #[inline(always)]
-    fn contains(&self, x: f32, y: f32) -> bool {
-        (x >= 0.0)
-            & (y >= self.strip.start as f32)
-            & (x < self.width as f32)
-            & (y < self.strip.end as f32)
     }
 }
 
@@ -281,7 +402,9 @@ struct QuadRow<'a> {
 
 /// Candidate pixels a quad may have in x and in y and still be drawn in lanes: twice magnified ones do. Larger quads are
 /// drawn one by one.
-const LANE_CANDIDATES: f32 = 4.0;
+const LANE_CANDIDATES: i32 = 4;
+/// Candidates whose hits fit into one word.
+const BATCH: usize = u64::BITS as usize / LANES;
 
 impl QuadRow<'_> {
     /// The sixteen quads from `column` on, side by side: every candidate pixel of every quad's bounding box is tested
@@ -289,101 +412,67 @@ impl QuadRow<'_> {
     #[inline(always)]
     fn draw_block(&self, column: usize, target: &mut Target) {
         let mut triangles = [0u8; LANES];
-        let quads = &self.cut[column..self.cut.len().min(column + LANES)];
-        triangles[..quads.len()].copy_from_slice(quads);
+        match self.cut[column..].first_chunk::<LANES>() {
+            Some(quads) => triangles = *quads,
+            None => {
+                for (triangles, quad) in triangles.iter_mut().zip(&self.cut[column..]) {
+                    *triangles = *quad;
+                }
+            }
+        }
         if u128::from_ne_bytes(triangles) == 0 {
             return;
         }
+        let (upper, lower) = (self.upper, self.lower);
         let corners = Corners {
-            x: self.corner_lanes(column, |vertices| &vertices.x),
-            y: self.corner_lanes(column, |vertices| &vertices.y),
-            inverse_depth: self.corner_lanes(column, |vertices| &vertices.inverse_depth),
+            x: four_corners(&upper.x, &lower.x, column),
+            y: four_corners(&upper.y, &lower.y, column),
+            inverse_depth: four_corners(&upper.inverse_depth, &lower.inverse_depth, column),
         };
-        // First candidate and number of candidates; none where nothing can be drawn.
-        let mut x_first = [0.0; LANES];
-        let mut y_first = [0.0; LANES];
-        let mut x_count = [0.0; LANES];
-        let mut y_count = [0.0; LANES];
+        let mut block = Block::NONE;
+        block.bound(&corners, &triangles, target);
+        let mut x_steps = 0;
+        let mut y_steps = 0;
         for lane in 0..LANES {
-            let corner = |plane: &[Lanes; 4], pick: fn(f32, f32) -> f32| {
-                pick(
-                    pick(plane[0][lane], plane[1][lane]),
-                    pick(plane[2][lane], plane[3][lane]),
-                )
-            };
-            let x_low = ceil(corner(&corners.x, min) - EDGE_SLACK);
-            let y_low = ceil(corner(&corners.y, min) - EDGE_SLACK);
-            let x_high = floor(corner(&corners.x, max) + EDGE_SLACK);
-            let y_high = floor(corner(&corners.y, max) + EDGE_SLACK);
-            let touches = (triangles[lane] != 0)
-                & (x_high >= 0.0)
-                & (x_low < target.width as f32)
-                & (y_high >= target.strip.start as f32)
-                & (y_low < target.strip.end as f32);
-            x_first[lane] = x_low;
-            y_first[lane] = y_low;
-            x_count[lane] = if touches { x_high - x_low + 1.0 } else { 0.0 };
-            y_count[lane] = if touches { y_high - y_low + 1.0 } else { 0.0 };
+            x_steps = x_steps.max(block.x_count[lane]);
+            y_steps = y_steps.max(block.y_count[lane]);
         }
-        let mut x_steps = 0.0f32;
-        let mut y_steps = 0.0f32;
-        let mut oversized = false;
-        for lane in 0..LANES {
-            let fits = (x_count[lane] <= LANE_CANDIDATES) & (y_count[lane] <= LANE_CANDIDATES);
-            oversized |= !fits;
-            x_steps = max(x_steps, if fits { x_count[lane] } else { 0.0 });
-            y_steps = max(y_steps, if fits { y_count[lane] } else { 0.0 });
+        if x_steps == 0 {
+            return;
         }
-        if oversized {
+        if x_steps > LANE_CANDIDATES || y_steps > LANE_CANDIDATES {
+            (x_steps, y_steps) = (0, 0);
             for lane in 0..LANES {
-                if (x_count[lane] > LANE_CANDIDATES) | (y_count[lane] > LANE_CANDIDATES) {
+                let (x_count, y_count) = (block.x_count[lane], block.y_count[lane]);
+                if x_count > LANE_CANDIDATES || y_count > LANE_CANDIDATES {
                     self.draw_quad(column + lane, triangles[lane], target);
                     triangles[lane] = 0;
+                } else {
+                    x_steps = x_steps.max(x_count);
+                    y_steps = y_steps.max(y_count);
                 }
             }
         }
-        for y_step in 0..y_steps as usize {
-            for x_step in 0..x_steps as usize {
-                let mut samples = [0; LANES];
-                let mut xs = [0.0; LANES];
-                let mut ys = [0.0; LANES];
-                for lane in 0..LANES {
-                    let x = x_first[lane] + x_step as f32;
-                    let y = y_first[lane] + y_step as f32;
-                    let sample = corners.sample(
-                        lane,
-                        triangles[lane],
-                        (column + lane) as f32,
-                        self.row,
-                        (x, y),
-                    );
-                    xs[lane] = x;
-                    ys[lane] = y;
-                    samples[lane] = if target.contains(x, y) { sample } else { 0 };
-                }
-                for lane in 0..LANES {
-                    if samples[lane] != 0 {
-                        target.put(xs[lane], ys[lane], samples[lane]);
-                    }
-                }
+        block.prepare(&corners, &triangles, column, self.row);
+        let steps = x_steps * y_steps;
+        for first in (0..steps).step_by(BATCH) {
+            // The hits of up to four candidates are written together: the end of the loop over them is hard to foresee.
+            let mut batch = Batch::NONE;
+            let mut hits = 0u64;
+            for slot in 0..BATCH.min((steps - first) as usize) as i32 {
+                let step = first + slot;
+                let (x_step, y_step) = (step % x_steps, step / x_steps);
+                let found = block.sample(x_step, y_step, target, &mut batch, slot as usize);
+                hits |= u64::from(found) << (slot as usize * LANES);
+            }
+            while hits != 0 {
+                let hit = hits.trailing_zeros() as usize;
+                hits &= hits - 1;
+                let sample = (u64::from(batch.high[hit]) << 32) | u64::from(batch.low[hit]);
+                let slot = &mut target.map[batch.pixel[hit] as usize];
+                *slot = (*slot).max(sample);
             }
         }
-    }
-
-    /// Upper left, upper right, lower left, lower right of sixteen quads.
-    #[inline(always)]
-    fn corner_lanes(&self, column: usize, plane: fn(&VertexRow) -> &[f32]) -> [Lanes; 4] {
-        let lanes = |vertices: &VertexRow, column: usize| -> Lanes {
-            *plane(vertices)[column..]
-                .first_chunk()
-                .expect("rows are padded to whole blocks")
-        };
-        [
-            lanes(self.upper, column),
-            lanes(self.upper, column + 1),
-            lanes(self.lower, column),
-            lanes(self.lower, column + 1),
-        ]
     }
 
     /// One quad of any size.
@@ -426,43 +515,239 @@ struct Corners {
     inverse_depth: [Lanes; 4],
 }
 
-impl Corners {
-    /// What the quad of a lane shows at a pixel; 0 = nothing.
+/// Upper left, upper right, lower left, lower right of sixteen quads.
+#[inline(always)]
+fn four_corners(upper: &[f32], lower: &[f32], column: usize) -> [Lanes; 4] {
+    let upper = &upper[column..column + LANES + 1];
+    let lower = &lower[column..column + LANES + 1];
+    let mut corners = [[0.0; LANES]; 4];
+    corners[0].copy_from_slice(&upper[..LANES]);
+    corners[1].copy_from_slice(&upper[1..=LANES]);
+    corners[2].copy_from_slice(&lower[..LANES]);
+    corners[3].copy_from_slice(&lower[1..=LANES]);
+    corners
+}
+
+/// Sixteen quads ready to be sampled. Offsets are from the upper right vertex, which both triangles share; `a` is the
+/// vertex that is particular to a triangle: the upper left (index 0) or the lower right one (1).
+struct Block {
+    /// Bounding boxes, pixels; no candidates where nothing can be drawn.
+    x_first: [i32; LANES],
+    y_first: [i32; LANES],
+    x_count: [i32; LANES],
+    y_count: [i32; LANES],
+    /// Of the first candidate.
+    dx: Lanes,
+    dy: Lanes,
+    /// The diagonal, upper right to lower left.
+    diagonal_x: Lanes,
+    diagonal_y: Lanes,
+    /// Infinite where one of the triangles covers nothing: which one to look at is then decided.
+    side_bias: Lanes,
+    /// Towards `a`, divided by the triangle's area (of a sign for each side).
+    edge_x: [Lanes; 2],
+    edge_y: [Lanes; 2],
+    inverse_area: [Lanes; 2],
+    inverse_depth_a: [Lanes; 2],
+    inverse_depth_right: Lanes,
+    inverse_depth_left: Lanes,
+    /// Source position of the upper left vertex in steps, plus [`INTEGER`].
+    u_steps: Lanes,
+    v_steps: f32,
+}
+
+/// What up to four candidates of sixteen quads show.
+struct Batch {
+    high: [u32; BATCH * LANES],
+    low: [u32; BATCH * LANES],
+    /// Of the strip's map.
+    pixel: [u32; BATCH * LANES],
+}
+
+impl Batch {
+    const NONE: Self = Self {
+        high: [0; BATCH * LANES],
+        low: [0; BATCH * LANES],
+        pixel: [0; BATCH * LANES],
+    };
+}
+
+impl Block {
+    const NONE: Self = Self {
+        x_first: [0; LANES],
+        y_first: [0; LANES],
+        x_count: [0; LANES],
+        y_count: [0; LANES],
+        dx: [0.0; LANES],
+        dy: [0.0; LANES],
+        diagonal_x: [0.0; LANES],
+        diagonal_y: [0.0; LANES],
+        side_bias: [0.0; LANES],
+        edge_x: [[0.0; LANES]; 2],
+        edge_y: [[0.0; LANES]; 2],
+        inverse_area: [[0.0; LANES]; 2],
+        inverse_depth_a: [[0.0; LANES]; 2],
+        inverse_depth_right: [0.0; LANES],
+        inverse_depth_left: [0.0; LANES],
+        u_steps: [0.0; LANES],
+        v_steps: 0.0,
+    };
+
+    /// Bounding boxes on the target.
+    #[inline(always)]
+    fn bound(&mut self, corners: &Corners, triangles: &[u8; LANES], target: &Target) {
+        let [x0, x1, x2, x3] = &corners.x;
+        let [y0, y1, y2, y3] = &corners.y;
+        let (width, end) = (target.width as f32, target.strip.end as f32);
+        let start = target.strip.start as f32;
+        for lane in 0..LANES {
+            let x_low = min(min(x0[lane], x1[lane]), min(x2[lane], x3[lane]));
+            let x_high = max(max(x0[lane], x1[lane]), max(x2[lane], x3[lane]));
+            let y_low = min(min(y0[lane], y1[lane]), min(y2[lane], y3[lane]));
+            let y_high = max(max(y0[lane], y1[lane]), max(y2[lane], y3[lane]));
+            let (x_low, x_high) = (ceil(x_low - EDGE_SLACK), floor(x_high + EDGE_SLACK));
+            let (y_low, y_high) = (ceil(y_low - EDGE_SLACK), floor(y_high + EDGE_SLACK));
+            let touches = (triangles[lane] != 0)
+                & (x_high >= 0.0)
+                & (x_low < width)
+                & (y_high >= start)
+                & (y_low < end)
+                & (x_high >= x_low)
+                & (y_high >= y_low);
+            self.x_first[lane] = integer(x_low);
+            self.y_first[lane] = integer(y_low);
+            self.x_count[lane] = if touches {
+                integer(x_high - x_low) + 1
+            } else {
+                0
+            };
+            self.y_count[lane] = if touches {
+                integer(y_high - y_low) + 1
+            } else {
+                0
+            };
+            self.dx[lane] = x_low - x1[lane];
+            self.dy[lane] = y_low - y1[lane];
+        }
+    }
+
+    #[inline(always)]
+    fn prepare(&mut self, corners: &Corners, triangles: &[u8; LANES], column: usize, row: f32) {
+        let [x0, x1, x2, x3] = &corners.x;
+        let [y0, y1, y2, y3] = &corners.y;
+        let [i0, i1, i2, i3] = &corners.inverse_depth;
+        for lane in 0..LANES {
+            let has_upper_left = triangles[lane] & UPPER_LEFT != 0;
+            let has_lower_right = triangles[lane] & LOWER_RIGHT != 0;
+            let (right, left) = (i1[lane], i2[lane]);
+            let behind = min(right, left) <= 0.0;
+            let diagonal_x = x2[lane] - x1[lane];
+            let diagonal_y = y2[lane] - y1[lane];
+            let edge_x = (x0[lane] - x1[lane], x3[lane] - x1[lane]);
+            let edge_y = (y0[lane] - y1[lane], y3[lane] - y1[lane]);
+            // Vertices clockwise as seen (y down); the other way round is a back face and covers nothing.
+            let area = (
+                diagonal_x * edge_y.0 - diagonal_y * edge_x.0,
+                diagonal_x * edge_y.1 - diagonal_y * edge_x.1,
+            );
+            let shows = (
+                has_upper_left & (area.0 > 0.0) & (i0[lane] > 0.0) & !behind,
+                has_lower_right & (area.1 < 0.0) & (i3[lane] > 0.0) & !behind,
+            );
+            // Weights of what does not show are NaN, which no comparison accepts.
+            let inverse_area = (
+                if shows.0 {
+                    reciprocal(area.0)
+                } else {
+                    f32::NAN
+                },
+                if shows.1 {
+                    -reciprocal(-area.1)
+                } else {
+                    f32::NAN
+                },
+            );
+            self.diagonal_x[lane] = diagonal_x;
+            self.diagonal_y[lane] = diagonal_y;
+            let bias = if shows.1 { 0.0 } else { f32::INFINITY };
+            self.side_bias[lane] = if shows.0 { bias } else { f32::NEG_INFINITY };
+            self.edge_x[0][lane] = edge_x.0 * inverse_area.0;
+            self.edge_x[1][lane] = edge_x.1 * inverse_area.1;
+            self.edge_y[0][lane] = edge_y.0 * inverse_area.0;
+            self.edge_y[1][lane] = edge_y.1 * inverse_area.1;
+            self.inverse_area[0][lane] = inverse_area.0;
+            self.inverse_area[1][lane] = inverse_area.1;
+            self.inverse_depth_a[0][lane] = i0[lane];
+            self.inverse_depth_a[1][lane] = i3[lane];
+            self.inverse_depth_right[lane] = right;
+            self.inverse_depth_left[lane] = left;
+            self.u_steps[lane] = (column + lane) as f32 * STEPS + INTEGER;
+        }
+        self.v_steps = row * STEPS + INTEGER;
+    }
+
+    /// What every quad shows at one of its candidates, into `slot` of the batch; returns the lanes that show anything, a
+    /// bit mask.
     #[inline(always)]
     fn sample(
         &self,
-        lane: usize,
-        triangles: u8,
-        column: f32,
-        row: f32,
-        (x, y): (f32, f32),
-    ) -> Sample {
-        let at = |corner: usize| (self.x[corner][lane], self.y[corner][lane]);
-        let (upper_right, lower_left) = (at(1), at(2));
-        // Each triangle lies on its side of the diagonal, if it shows its front.
-        let side = (lower_left.0 - upper_right.0) * (y - upper_right.1)
-            - (lower_left.1 - upper_right.1) * (x - upper_right.0);
-        let has_upper_left = triangles & UPPER_LEFT != 0;
-        let has_lower_right = triangles & LOWER_RIGHT != 0;
-        let upper_left = has_upper_left & ((side >= 0.0) | !has_lower_right);
-        let pick = |a: f32, b: f32| if upper_left { a } else { b };
-        let vertex = |one: usize, other: usize, (right, down): (f32, f32)| Vertex {
-            x: pick(self.x[one][lane], self.x[other][lane]),
-            y: pick(self.y[one][lane], self.y[other][lane]),
-            inverse_depth: pick(
-                self.inverse_depth[one][lane],
-                self.inverse_depth[other][lane],
-            ),
-            column: column + pick(right, 1.0 - right),
-            row: row + pick(down, 1.0 - down),
-        };
-        let triangle = [
-            vertex(0, 3, (0.0, 0.0)),
-            vertex(1, 2, (1.0, 0.0)),
-            vertex(2, 1, (0.0, 1.0)),
-        ];
-        let (sample, inside) = sample_triangle(triangle, x, y);
-        if inside & (triangles != 0) { sample } else { 0 }
+        x_step: i32,
+        y_step: i32,
+        target: &Target,
+        batch: &mut Batch,
+        slot: usize,
+    ) -> u16 {
+        let lanes = slot * LANES..(slot + 1) * LANES;
+        let highs = &mut batch.high[lanes.clone()];
+        let lows = &mut batch.low[lanes.clone()];
+        let pixels = &mut batch.pixel[lanes];
+        let (width, start) = (target.width as i32, target.strip.start as i32);
+        let rows = target.strip.len() as u32;
+        let mut hits = [0u16; LANES];
+        for lane in 0..LANES {
+            let dx = self.dx[lane] + x_step as f32;
+            let dy = self.dy[lane] + y_step as f32;
+            // Each triangle lies on its side of the diagonal.
+            let side = self.diagonal_x[lane] * dy - self.diagonal_y[lane] * dx;
+            let upper_left = side + self.side_bias[lane] >= 0.0;
+            let one = if upper_left { u32::MAX } else { 0 };
+            // By bits, because a choice between two places in memory would become a gather.
+            let pick = |of: &[Lanes; 2]| {
+                f32::from_bits((of[0][lane].to_bits() & one) | (of[1][lane].to_bits() & !one))
+            };
+            // Barycentric weights on the target image. An edge belongs to both its triangles: no cracks.
+            let weight_a = side * pick(&self.inverse_area);
+            let weight_left = dx * pick(&self.edge_y) - dy * pick(&self.edge_x);
+            let weight_right = 1.0 - weight_a - weight_left;
+            let (x, y) = (
+                self.x_first[lane] + x_step,
+                self.y_first[lane] + y_step - start,
+            );
+            let hit = (weight_a >= -EDGE_SLACK)
+                & (weight_left >= -EDGE_SLACK)
+                & (weight_right >= -EDGE_SLACK)
+                & ((x as u32) < width as u32)
+                & ((y as u32) < rows);
+            // On the surface: weights divided by depth.
+            let right = weight_right * self.inverse_depth_right[lane];
+            let left = weight_left * self.inverse_depth_left[lane];
+            let inverse_depth = weight_a * pick(&self.inverse_depth_a) + right + left;
+            let depth = reciprocal(inverse_depth);
+            let (right, left) = (right * depth, left * depth);
+            let (right, down) = if upper_left {
+                (right, left)
+            } else {
+                (1.0 - left, 1.0 - right)
+            };
+            let u = (max(right, 0.0) * STEPS + self.u_steps[lane]).to_bits() & INTEGER_MASK;
+            let v = (max(down, 0.0) * STEPS + self.v_steps).to_bits() & INTEGER_MASK;
+            let depth_bits = inverse_depth.to_bits() >> INVERSE_DEPTH_SHIFT;
+            highs[lane] = (depth_bits << (2 * POSITION_BITS - 32)) | (v >> (32 - POSITION_BITS));
+            lows[lane] = (v << POSITION_BITS) | u;
+            pixels[lane] = (y * width + x) as u32;
+            hits[lane] = u16::from(hit) << lane;
+        }
+        hits.iter().fold(0, |mask, hit| mask | hit)
     }
 }
 

@@ -6,7 +6,10 @@ use image::{DynamicImage, ImageDecoder, ImageFormat, ImageReader};
 
 use super::{Limits, shortened, size};
 use crate::{
-    model::{frame::RgbImage, refusal::Refusal},
+    model::{
+        frame::{GreyImage, RgbImage},
+        refusal::Refusal,
+    },
     stages::interpolate::project::SIDE_MAX,
     wire::proto::Image,
 };
@@ -41,6 +44,22 @@ pub fn colour(image: &Image, limits: Limits) -> Result<RgbImage, Refusal> {
         }
     };
     Ok(RgbImage {
+        width,
+        height,
+        data,
+    })
+}
+
+/// The luminance of what [`colour`] takes.
+///
+/// # Errors
+/// As [`colour`].
+pub fn grey(image: &Image, limits: Limits) -> Result<GreyImage, Refusal> {
+    if image.encoding != "mono8" {
+        return Ok(colour(image, limits)?.grey());
+    }
+    let (width, height, data) = raw(image, limits, 1, 1, |row, data| data.extend_from_slice(row))?;
+    Ok(GreyImage {
         width,
         height,
         data,

@@ -3,15 +3,20 @@
 
 pub mod image;
 
+mod rig;
+
+use nalgebra::Point3;
 use prost::Message;
 use prost_types::Timestamp;
+
+pub use rig::{calibration, markers_sample};
 
 use super::proto;
 use crate::{
     config::Settings,
     model::{
-        camera::{Calibration, Intrinsics, PlumbBob},
-        frame::RgbImage,
+        camera::{Calibration, Intrinsics, PlumbBob, RigCalibration},
+        frame::{GreyImage, RgbImage},
         pose::{Pose, PoseNoise, pose_from_parts},
         refusal::Refusal,
     },
@@ -53,27 +58,56 @@ pub struct PackedFrame {
     pub sequence: u64,
     pub world_from_camera: Option<Pose>,
     pub pose_noise: Option<PoseNoise>,
-    pub calibration: Option<Calibration>,
+    /// Metres, in the calibration's order; `None` for what the tracker does not see.
+    pub marker_in_world: Option<Vec<Option<Point3<f64>>>>,
+    pub calibration: Option<RigCalibration>,
     image: proto::Image,
-    depth: proto::Image,
+    depth: PackedDepth,
+}
+
+#[derive(Debug, Clone)]
+enum PackedDepth {
+    Given(proto::Image),
+    /// Left and right.
+    Sides(Box<[proto::Image; 2]>),
 }
 
 /// Pictures of a frame, unpacked.
 #[derive(Debug, Clone)]
 pub struct Pictures {
     pub image: RgbImage,
+    pub depth: PicturedDepth,
+}
+
+#[derive(Debug, Clone)]
+pub enum PicturedDepth {
     /// Metres; 0 = none. As many as the image has pixels.
-    pub depth_m: Vec<f32>,
+    Given(Vec<f32>),
+    Sides {
+        left: GreyImage,
+        right: GreyImage,
+    },
 }
 
 impl PackedFrame {
-    /// Unpacks image and depth; they have the same size.
+    /// Unpacks the image, and depth of the same size or the side cameras' images.
     ///
     /// # Errors
     /// What [`image`] refuses, and depth of another size than the image.
     pub fn pictures(&self, limits: Limits) -> Result<Pictures, Refusal> {
         let image = image::colour(&self.image, limits)?;
-        let (width, height, depth_m) = image::depth_m(&self.depth, limits)?;
+        let depth = match &self.depth {
+            PackedDepth::Given(depth) => depth,
+            PackedDepth::Sides(sides) => {
+                let [left, right] = sides.as_ref();
+                let depth = PicturedDepth::Sides {
+                    left: image::grey(left, limits)?,
+                    right: image::grey(right, limits)?,
+                };
+                return Ok(Pictures { image, depth });
+            }
+        };
+        let (width, height, depth_m) = image::depth_m(depth, limits)?;
         if (width, height) != (image.width, image.height) {
             return Err(Refusal::new(
                 "depth_size",
@@ -83,7 +117,10 @@ impl PackedFrame {
                 ),
             ));
         }
-        Ok(Pictures { image, depth_m })
+        Ok(Pictures {
+            image,
+            depth: PicturedDepth::Given(depth_m),
+        })
     }
 }
 
@@ -113,6 +150,7 @@ pub fn frame(frame: proto::Frame) -> Result<PackedFrame, Refusal> {
     let stamp_ns = required_stamp_ns(frame.stamp.as_ref())?;
     let world_from_camera = frame.world_from_camera.as_ref().map(pose).transpose()?;
     let pose_noise = pose_noise(frame.pose_position_sd, frame.pose_rotation_sd)?;
+    let marker_in_world = frame.markers.as_ref().map(rig::markers).transpose()?;
     let calibration = frame.calibration.as_ref().map(calibration).transpose()?;
     let image = frame.image.ok_or_else(|| {
         Refusal::new(
@@ -120,17 +158,22 @@ pub fn frame(frame: proto::Frame) -> Result<PackedFrame, Refusal> {
             "the frame has no image: put the camera's picture into `image`",
         )
     })?;
-    let depth = frame.depth.ok_or_else(|| {
-        Refusal::new(
-            "no_depth",
-            "the frame has no depth: put a depth image registered to the picture into `depth`",
-        )
-    })?;
+    let depth = match (frame.depth, frame.left, frame.right) {
+        (Some(depth), ..) => PackedDepth::Given(depth),
+        (None, Some(left), Some(right)) => PackedDepth::Sides(Box::new([left, right])),
+        (None, ..) => {
+            return Err(Refusal::new(
+                "no_depth",
+                "the frame has no depth: put a depth image registered to the picture into `depth`, or the pictures of the cameras beside it into `left` and `right`",
+            ));
+        }
+    };
     Ok(PackedFrame {
         stamp_ns,
         sequence: frame.sequence,
         world_from_camera,
         pose_noise,
+        marker_in_world,
         calibration,
         image,
         depth,
@@ -151,18 +194,6 @@ pub fn pose_sample(bytes: &[u8]) -> Result<(i64, Pose), Refusal> {
         )
     })?;
     Ok((stamp_ns, pose(world_from_camera)?))
-}
-
-/// # Errors
-/// `calibration` without a middle camera, and what [`intrinsics`] refuses.
-pub fn calibration(calibration: &proto::Calibration) -> Result<Calibration, Refusal> {
-    let middle = calibration.middle.as_ref().ok_or_else(|| {
-        Refusal::new(
-            "calibration",
-            "the calibration has no `middle`: that is the camera whose images come as `image`",
-        )
-    })?;
-    intrinsics(middle)
 }
 
 /// # Errors

@@ -5,7 +5,7 @@
 pub enum Isa {
     /// What the target guarantees: SSE2 on x86-64, NEON on aarch64.
     Portable,
-    /// AVX2, FMA, BMI2, F16C: x86-64 processors since 2013.
+    /// AVX2, FMA, F16C, BMI: x86-64 processors since 2013.
     Avx2,
     /// AVX-512 F, BW, DQ, VL.
     Avx512,
@@ -18,8 +18,9 @@ impl Isa {
         {
             let avx2 = is_x86_feature_detected!("avx2")
                 && is_x86_feature_detected!("fma")
-                && is_x86_feature_detected!("bmi2")
-                && is_x86_feature_detected!("f16c");
+                && is_x86_feature_detected!("f16c")
+                && is_x86_feature_detected!("bmi1")
+                && is_x86_feature_detected!("bmi2");
             let avx512 = is_x86_feature_detected!("avx512f")
                 && is_x86_feature_detected!("avx512bw")
                 && is_x86_feature_detected!("avx512dq")
@@ -49,31 +50,37 @@ impl Isa {
     }
 }
 
-/// Compiles a kernel, an `#[inline(always)]` function, once for each instruction set, and picks by the first argument.
-/// No floating-point operation is fused or reordered, so the results are the same to the bit.
+/// Compiles a kernel, an `#[inline(always)]` function, once for each instruction set, and picks by the first argument. A
+/// kernel with a twin for AVX names both. No floating-point operation is fused or reordered, so the results are the same to the bit.
 macro_rules! for_each_isa {
     ($(#[$doc:meta])* $visibility:vis fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $kernel:path;) => {
+        $crate::isa::for_each_isa! {
+            $(#[$doc])*
+            $visibility fn $name($($argument: $kind),*) = $kernel, avx $kernel;
+        }
+    };
+    ($(#[$doc:meta])* $visibility:vis fn $name:ident($($argument:ident: $kind:ty),* $(,)?) = $kernel:path, avx $avx:path;) => {
         $(#[$doc])*
         #[allow(clippy::too_many_arguments)]
-        $visibility fn $name(isa: $crate::engine::isa::Isa, $($argument: $kind),*) {
+        $visibility fn $name(isa: $crate::isa::Isa, $($argument: $kind),*) {
             #[cfg(target_arch = "x86_64")]
             {
-                #[target_feature(enable = "avx2,fma,bmi2")]
+                #[target_feature(enable = "avx2,f16c,bmi1,bmi2")]
                 #[allow(clippy::too_many_arguments)]
                 fn avx2($($argument: $kind),*) {
-                    $kernel($($argument),*)
+                    $avx($($argument),*)
                 }
-                #[target_feature(enable = "avx2,fma,bmi2,avx512f,avx512bw,avx512dq,avx512vl")]
+                #[target_feature(enable = "avx2,f16c,bmi1,bmi2,avx512f,avx512bw,avx512dq,avx512vl")]
                 #[allow(clippy::too_many_arguments)]
                 fn avx512($($argument: $kind),*) {
-                    $kernel($($argument),*)
+                    $avx($($argument),*)
                 }
                 match isa {
                     // SAFETY: an `Isa` beyond `Portable` is only made where the processor has it.
-                    $crate::engine::isa::Isa::Avx512 => return unsafe { avx512($($argument),*) },
+                    $crate::isa::Isa::Avx512 => return unsafe { avx512($($argument),*) },
                     // SAFETY: as above.
-                    $crate::engine::isa::Isa::Avx2 => return unsafe { avx2($($argument),*) },
-                    $crate::engine::isa::Isa::Portable => {}
+                    $crate::isa::Isa::Avx2 => return unsafe { avx2($($argument),*) },
+                    $crate::isa::Isa::Portable => {}
                 }
             }
             let _ = isa;

@@ -1,0 +1,120 @@
+//! `evaluate --depth`: how good the depth from three cameras is, on a stereo folder or on simulated frames.
+
+use std::path::Path;
+
+use serde_json::json;
+
+use crate::{
+    config::Settings,
+    evaluation::{
+        simulated_depth,
+        stereo::{self, Cameras, StereoScene},
+        table::{Table, number},
+    },
+    pipeline::depth_range,
+    simulation::script::Script,
+    stages::depth::{DepthSettings, InverseDepthRange},
+};
+
+/// In place of a folder.
+pub const SIMULATED: &str = "simulated";
+/// Of the tabletop script: one in so many, from this one on. Some of them show the glass, some the cup.
+const SIMULATED_FIRST: u64 = 40;
+const SIMULATED_EVERY: u64 = 160;
+
+/// # Errors
+/// A folder that cannot be read.
+pub fn run(what: &str, settings: &Settings, seed: u64, as_json: bool) -> anyhow::Result<()> {
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(settings.threads)
+        .build()?;
+    if what == SIMULATED {
+        pool.install(|| simulated(settings, seed, as_json));
+        Ok(())
+    } else {
+        pool.install(|| stereo_folder(Path::new(what), as_json))
+    }
+}
+
+fn stereo_folder(folder: &Path, as_json: bool) -> anyhow::Result<()> {
+    let scene = StereoScene::open(folder)?;
+    let range = disparities(&scene);
+    let bad = |cameras| stereo::evaluate(&scene, DepthSettings::default(), cameras, &range);
+    let (three, two) = (bad(Cameras::Three), bad(Cameras::Two));
+    if as_json {
+        let mut report = json!(three);
+        report["folder"] = json!(folder.display().to_string());
+        report["most_disparity_px"] = json!(range.near);
+        report["labels"] = json!(range.labels);
+        report["two_cameras"] = json!(two);
+        println!("{report}");
+        return Ok(());
+    }
+    let mut table = Table::new(&[
+        "cameras",
+        "bad > 1 px %",
+        "> 0.5 px %",
+        "at jumps %",
+        "half hidden %",
+        "of valid %",
+        "no depth %",
+        "mean error px",
+    ]);
+    for (cameras, bad) in [("3", three), ("2", two)] {
+        table.row(vec![
+            cameras.to_owned(),
+            number(Some(bad.bad_over_1px), 2),
+            number(Some(bad.bad_over_half_px), 2),
+            number(Some(bad.near_discontinuities), 2),
+            number(Some(bad.half_occluded), 2),
+            number(Some(bad.bad_of_valid), 2),
+            number(Some(bad.invalid), 2),
+            number(Some(bad.mean_error_px), 3),
+        ]);
+    }
+    print!("{table}");
+    Ok(())
+}
+
+/// From infinitely far to a little beyond the scene's greatest disparity, in half pixels: as is usual for such scenes,
+/// how near things come is told beforehand.
+fn disparities(scene: &StereoScene) -> InverseDepthRange {
+    let most = scene.disparity.iter().copied().fold(0.0, f32::max).ceil() + 2.0;
+    let labels = (2.0 * most) as usize + 1;
+    InverseDepthRange::new(0.0, f64::from(most), labels.min(255))
+        .expect("a scene knows some disparity")
+}
+
+fn simulated(settings: &Settings, seed: u64, as_json: bool) {
+    let script = Script::tabletop(seed);
+    let end = script.frames.unwrap_or(0);
+    let frames: Vec<u64> = (SIMULATED_FIRST..end)
+        .step_by(SIMULATED_EVERY as usize)
+        .collect();
+    let within = simulated_depth::evaluate(&script, &frames, depth_range(settings));
+    if as_json {
+        println!("{}", json!(within));
+        return;
+    }
+    let mut table = Table::new(&[
+        "frames",
+        "labels",
+        "within one %",
+        "cloth %",
+        "glass %",
+        "behind glass %",
+        "no depth %",
+        "median error %",
+    ]);
+    table.row(vec![
+        within.frames.to_string(),
+        within.labels.to_string(),
+        number(within.within_one_label, 2),
+        number(within.cloth, 2),
+        number(within.glass, 2),
+        number(within.behind_glass, 2),
+        number(within.invalid, 2),
+        number(within.median_error, 2),
+    ]);
+    print!("{table}");
+}

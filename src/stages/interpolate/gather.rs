@@ -1,0 +1,365 @@
+//! Fetches what a pixel comes from: the three records of its triangle in every view, summed over the views.
+//!
+//! Samples of sixteen pixels -> where their records lie and what they weigh ([`Source`]), then sums of a pixel over
+//! views ([`Sums`]). Records are interleaved, so a corner is one load; the sixteen pixels are turned into planes at the
+//! end. Two twins give the same bits: one with 256-bit registers and one for any processor.
+
+use crate::{
+    lanes::{LANES, Lanes, members, prefetch},
+    model::belief::{LEVEL_SCALE, Record, f32_from_f16},
+};
+
+use super::project::{POSITION_BITS, POSITION_MASK, STEPS, Sample, sample_inverse_depth};
+
+/// Steps of a source pixel, as integers.
+const WHOLE: u32 = STEPS as u32;
+/// Units of [`Sums`]' levels per grey level: weights count [`STEPS`], so that the sum over a triangle is exact.
+pub const LEVEL_UNITS: f32 = LEVEL_SCALE * STEPS;
+
+/// Where sixteen pixels come from in one view. Indices lie inside the view, whatever the samples.
+#[derive(Clone, Copy)]
+pub struct Source {
+    upper_left: [u32; LANES],
+    /// Upper left or lower right, whichever belongs to the triangle.
+    corner: [u32; LANES],
+    /// Of the corner, the upper right and the lower left record; 0 where unseen.
+    pub weights: [Lanes; 3],
+    /// The same in [`STEPS`]; two of them in one word, the first below.
+    corner_and_right: [u32; LANES],
+    lower_left: [u32; LANES],
+    /// 1/metres; 0 where unseen.
+    pub inverse_depth: Lanes,
+}
+
+impl Source {
+    pub const NONE: Self = Self {
+        upper_left: [0; LANES],
+        corner: [0; LANES],
+        weights: [[0.0; LANES]; 3],
+        corner_and_right: [0; LANES],
+        lower_left: [0; LANES],
+        inverse_depth: [0.0; LANES],
+    };
+
+    /// One pixel, of a view of `width * height` pixels, at least 2x2.
+    #[inline(always)]
+    pub fn locate(&mut self, lane: usize, sample: Sample, width: u32, height: u32) {
+        let u = (sample & POSITION_MASK) as u32;
+        let v = ((sample >> POSITION_BITS) & POSITION_MASK) as u32;
+        // A sample on the last column or row belongs to the quad before it.
+        let column = (u / WHOLE).min(width - 2);
+        let row = (v / WHOLE).min(height - 2);
+        let right = (u - column * WHOLE).min(WHOLE);
+        let down = (v - row * WHOLE).min(WHOLE);
+        let upper_left = row * width + column;
+        let in_lower_right = right + down > WHOLE;
+        let corner = upper_left + if in_lower_right { width + 1 } else { 0 };
+        let w = [
+            if in_lower_right {
+                right + down - WHOLE
+            } else {
+                WHOLE - (right + down)
+            },
+            if in_lower_right { WHOLE - down } else { right },
+            if in_lower_right { WHOLE - right } else { down },
+        ];
+        self.upper_left[lane] = upper_left;
+        self.corner[lane] = corner;
+        self.corner_and_right[lane] = w[0] | (w[1] << 16);
+        self.lower_left[lane] = w[2];
+        for (weights, w) in self.weights.iter_mut().zip(w) {
+            weights[lane] = w as i32 as f32 * (1.0 / STEPS);
+        }
+        self.inverse_depth[lane] = sample_inverse_depth(sample);
+    }
+
+    /// Asks for what the row below will need: of its three records two are near those of this row.
+    #[inline(always)]
+    pub fn prefetch_below(&self, view: &GatherView) {
+        // Two records are one line of cache.
+        for lane in (0..LANES).step_by(2) {
+            prefetch(
+                view.records,
+                self.upper_left[lane] as usize + 2 * view.width,
+            );
+        }
+    }
+
+    /// The three records of a lane, in the order of the weights.
+    #[inline(always)]
+    pub fn records<'a>(&self, lane: usize, view: &GatherView<'a>) -> [&'a Record; 3] {
+        let upper_left = self.upper_left[lane] as usize;
+        [
+            &view.records[self.corner[lane] as usize],
+            &view.records[upper_left + 1],
+            &view.records[upper_left + view.width],
+        ]
+    }
+}
+
+/// A view's records, row by row, and its weight in means.
+#[derive(Clone, Copy)]
+pub struct GatherView<'a> {
+    pub records: &'a [Record],
+    pub width: usize,
+    pub weight: f32,
+}
+
+/// Sums of sixteen pixels over views, as planes.
+#[derive(Clone, Copy)]
+pub struct Sums {
+    /// Weighted spread: alpha, beta, sigma, p2.
+    pub spread: [Lanes; 8],
+    /// Weighted tau less `first`, then its weighted square; three channels and a spare each. In [`LEVEL_UNITS`] around
+    /// the stored offset.
+    pub level: [Lanes; 8],
+    /// Tau of the first view, then greatest less least tau; only when comparing.
+    pub range: [Lanes; 8],
+}
+
+impl Sums {
+    pub const ZERO: Self = Self {
+        spread: [[0.0; LANES]; 8],
+        level: [[0.0; LANES]; 8],
+        range: [[0.0; LANES]; 8],
+    };
+}
+
+/// The sums of one pixel, interleaved.
+type Tile = [[f32; 8]; LANES];
+
+/// The two twins.
+pub trait Gather {
+    /// Sums the views in `seen`, a bit mask a pixel; pixels without any get zeros. When `COMPARING`, views are compared
+    /// (squares and ranges); otherwise they all must weigh 1, and `first` is 0.
+    fn sum<const COMPARING: bool>(
+        views: &[GatherView],
+        sources: &[Source],
+        seen: &[u32; LANES],
+        sums: &mut Sums,
+    );
+}
+
+/// For any processor.
+pub struct Portable;
+
+impl Gather for Portable {
+    #[inline(always)]
+    fn sum<const COMPARING: bool>(
+        views: &[GatherView],
+        sources: &[Source],
+        seen: &[u32; LANES],
+        sums: &mut Sums,
+    ) {
+        let mut spreads: Tile = [[0.0; 8]; LANES];
+        let mut levels: Tile = [[0.0; 8]; LANES];
+        let mut ranges: Tile = [[0.0; 8]; LANES];
+        for lane in 0..LANES {
+            let spread = &mut spreads[lane];
+            // At most 16 views of 2^15 * 2^7: no overflow.
+            let mut whole = [0i32; 4];
+            let (mut sum, mut square) = ([0.0f32; 4], [0.0f32; 4]);
+            let mut first = None;
+            let mut low = [f32::INFINITY; 4];
+            let mut high = [f32::NEG_INFINITY; 4];
+            for index in members(seen[lane]) {
+                let source = &sources[index];
+                let records = source.records(lane, &views[index]);
+                let weight = views[index].weight;
+                for (record, weights) in records.into_iter().zip(&source.weights) {
+                    let w = weights[lane] * weight;
+                    for (spread, stored) in spread.iter_mut().zip(record.spread) {
+                        *spread += w * f32_from_f16(stored);
+                    }
+                }
+                let w = source.corner_and_right[lane];
+                let w = [w & 0xffff, w >> 16, source.lower_left[lane]];
+                let level: [i32; 4] = std::array::from_fn(|channel| {
+                    (0..3)
+                        .map(|corner| i32::from(records[corner].level[channel]) * w[corner] as i32)
+                        .sum()
+                });
+                if !COMPARING {
+                    for (whole, level) in whole.iter_mut().zip(level) {
+                        *whole += level;
+                    }
+                    continue;
+                }
+                let level = level.map(|level| level as f32);
+                let first = *first.get_or_insert(level);
+                for channel in 0..4 {
+                    let difference = level[channel] - first[channel];
+                    let weighted = weight * difference;
+                    sum[channel] += weighted;
+                    square[channel] += weighted * difference;
+                    low[channel] = low[channel].min(level[channel]);
+                    high[channel] = high[channel].max(level[channel]);
+                }
+            }
+            if !COMPARING {
+                sum = whole.map(|whole| whole as f32);
+            }
+            levels[lane][..4].copy_from_slice(&sum);
+            if COMPARING {
+                levels[lane][4..].copy_from_slice(&square);
+                ranges[lane][..4].copy_from_slice(&first.unwrap_or_default());
+                for channel in 0..4 {
+                    ranges[lane][4 + channel] = high[channel] - low[channel];
+                }
+            }
+        }
+        let planes = |tile: &Tile| std::array::from_fn(|k| std::array::from_fn(|l| tile[l][k]));
+        sums.spread = planes(&spreads);
+        sums.level = planes(&levels);
+        if COMPARING {
+            sums.range = planes(&ranges);
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub use x86::Avx;
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    use crate::lanes::members;
+
+    use super::{Gather, GatherView, LANES, Lanes, Source, Sums, Tile};
+
+    /// With AVX2 and F16C.
+    pub struct Avx;
+
+    impl Gather for Avx {
+        #[inline(always)]
+        fn sum<const COMPARING: bool>(
+            views: &[GatherView],
+            sources: &[Source],
+            seen: &[u32; LANES],
+            sums: &mut Sums,
+        ) {
+            // SAFETY: `Avx` is only named in kernels that are compiled for AVX2 and F16C.
+            unsafe { sum::<COMPARING>(views, sources, seen, sums) }
+        }
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2,f16c")]
+    fn sum<const COMPARING: bool>(
+        views: &[GatherView],
+        sources: &[Source],
+        seen: &[u32; LANES],
+        sums: &mut Sums,
+    ) {
+        let zero = _mm_setzero_si128();
+        let mut spreads: Tile = [[0.0; 8]; LANES];
+        let mut levels: Tile = [[0.0; 8]; LANES];
+        let mut ranges: Tile = [[0.0; 8]; LANES];
+        for lane in 0..LANES {
+            let mut spread = _mm256_setzero_ps();
+            let mut whole = zero;
+            let mut sum = _mm_setzero_ps();
+            let mut square = _mm_setzero_ps();
+            let mut first = _mm_setzero_ps();
+            let mut low = _mm_set1_ps(f32::INFINITY);
+            let mut high = _mm_set1_ps(f32::NEG_INFINITY);
+            let mut is_first = true;
+            for index in members(seen[lane]) {
+                let (source, view) = (&sources[index], &views[index]);
+                let records = source.records(lane, view);
+                // SAFETY: a record is 32 readable bytes: eight f16, then eight i16.
+                let halves = records.map(|record| unsafe {
+                    (
+                        _mm_loadu_si128(record.spread.as_ptr().cast()),
+                        _mm_loadu_si128(record.level.as_ptr().cast()),
+                    )
+                });
+                for ((stored, _), weights) in halves.into_iter().zip(&source.weights) {
+                    let w = if COMPARING {
+                        weights[lane] * view.weight
+                    } else {
+                        weights[lane]
+                    };
+                    let w = _mm256_set1_ps(w);
+                    spread = _mm256_add_ps(spread, _mm256_mul_ps(w, _mm256_cvtph_ps(stored)));
+                }
+                let [(_, corner), (_, upper_right), (_, lower_left)] = halves;
+                let two = _mm_madd_epi16(
+                    _mm_unpacklo_epi16(corner, upper_right),
+                    _mm_set1_epi32(source.corner_and_right[lane] as i32),
+                );
+                let one = _mm_madd_epi16(
+                    _mm_unpacklo_epi16(lower_left, zero),
+                    _mm_set1_epi32(source.lower_left[lane] as i32),
+                );
+                let level = _mm_add_epi32(two, one);
+                if COMPARING {
+                    let level = _mm_cvtepi32_ps(level);
+                    if is_first {
+                        first = level;
+                        is_first = false;
+                    }
+                    let difference = _mm_sub_ps(level, first);
+                    let weighted = _mm_mul_ps(_mm_set1_ps(view.weight), difference);
+                    sum = _mm_add_ps(sum, weighted);
+                    square = _mm_add_ps(square, _mm_mul_ps(weighted, difference));
+                    low = _mm_min_ps(low, level);
+                    high = _mm_max_ps(high, level);
+                } else {
+                    whole = _mm_add_epi32(whole, level);
+                }
+            }
+            if !COMPARING {
+                sum = _mm_cvtepi32_ps(whole);
+            }
+            // SAFETY: eight f32 each.
+            unsafe {
+                _mm256_storeu_ps(spreads[lane].as_mut_ptr(), spread);
+                _mm256_storeu_ps(levels[lane].as_mut_ptr(), _mm256_set_m128(square, sum));
+                if COMPARING {
+                    let range = _mm_sub_ps(high, low);
+                    _mm256_storeu_ps(ranges[lane].as_mut_ptr(), _mm256_set_m128(range, first));
+                }
+            }
+        }
+        planes(&spreads, &mut sums.spread);
+        planes(&levels, &mut sums.level);
+        if COMPARING {
+            planes(&ranges, &mut sums.range);
+        }
+    }
+
+    /// Transposes sixteen pixels of eight values.
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn planes(tile: &Tile, planes: &mut [Lanes; 8]) {
+        for half in 0..2 {
+            // SAFETY: eight f32 each.
+            let row = |index: usize| unsafe { _mm256_loadu_ps(tile[8 * half + index].as_ptr()) };
+            let pairs = |a: usize, b: usize| {
+                (
+                    _mm256_unpacklo_ps(row(a), row(b)),
+                    _mm256_unpackhi_ps(row(a), row(b)),
+                )
+            };
+            let (a0, a1) = pairs(0, 1);
+            let (b0, b1) = pairs(2, 3);
+            let (c0, c1) = pairs(4, 5);
+            let (d0, d1) = pairs(6, 7);
+            let low = |a, b| _mm256_shuffle_ps::<0b01_00_01_00>(a, b);
+            let high = |a, b| _mm256_shuffle_ps::<0b11_10_11_10>(a, b);
+            let left = [low(a0, b0), high(a0, b0), low(a1, b1), high(a1, b1)];
+            let right = [low(c0, d0), high(c0, d0), low(c1, d1), high(c1, d1)];
+            for k in 0..4 {
+                let lower = _mm256_permute2f128_ps::<0x20>(left[k], right[k]);
+                let upper = _mm256_permute2f128_ps::<0x31>(left[k], right[k]);
+                // SAFETY: a plane holds sixteen f32.
+                unsafe {
+                    _mm256_storeu_ps(planes[k].as_mut_ptr().add(8 * half), lower);
+                    _mm256_storeu_ps(planes[k + 4].as_mut_ptr().add(8 * half), upper);
+                }
+            }
+        }
+    }
+}
