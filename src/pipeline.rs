@@ -1,14 +1,17 @@
 //! The only file that knows the order of the stages. One pipeline is one place; a plain function from frame to report:
 //! no clock, no network, no locks.
 
-use std::{collections::HashMap, sync::Arc};
+use std::{cell::OnceCell, collections::HashMap, sync::Arc};
 
 use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
-    engine::cpu::{CpuEngine, Observation, RecallView, Score},
+    engine::{
+        Answer, Engine, Question,
+        cpu::{CpuEngine, Observation, RecallView, Score},
+    },
     isa::Isa,
     memory::{Memory, visit::Visit},
     model::{
@@ -82,12 +85,16 @@ pub struct Pipeline {
     settings: Settings,
     pool: Arc<ThreadPool>,
     sides_depth: SidesDepth,
-    engine: CpuEngine,
+    engine: Engine,
     refiner: PoseRefiner,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
     last_region_id: u64,
+    /// What the last frame's report needed.
     maps: Maps,
+    maps_read: bool,
+    /// All of them, if the engine kept some and somebody wanted them.
+    whole_maps: OnceCell<Maps>,
     workspace: Workspace,
 }
 
@@ -99,15 +106,28 @@ impl Pipeline {
 
     /// With other instructions than the best; they must exist on this processor.
     pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+        let engine = Engine::Cpu(CpuEngine::new(&settings, pool.clone(), isa));
+        Self::with_engine(settings, pool, isa, engine)
+    }
+
+    /// With an engine that was made for these settings.
+    pub fn with_engine(
+        settings: Settings,
+        pool: Arc<ThreadPool>,
+        isa: Isa,
+        engine: Engine,
+    ) -> Self {
         Self {
             sides_depth: SidesDepth::new(depth_range(&settings), isa),
-            engine: CpuEngine::new(&settings, pool.clone(), isa),
+            engine,
             pool,
             refiner: PoseRefiner::new(isa),
             memory: Memory::default(),
             cameras: HashMap::new(),
             last_region_id: 0,
             maps: Maps::default(),
+            maps_read: true,
+            whole_maps: OnceCell::new(),
             workspace: Workspace::default(),
             settings,
         }
@@ -123,7 +143,28 @@ impl Pipeline {
 
     /// Of the last frame that was processed or evaluated.
     pub fn maps(&self) -> &Maps {
-        &self.maps
+        if self.maps_read {
+            return &self.maps;
+        }
+        self.whole_maps.get_or_init(|| {
+            let mut maps = Maps {
+                intrinsics: self.maps.intrinsics,
+                evidence: self.maps.evidence.clone(),
+                ..Maps::default()
+            };
+            maps.score.gain = self.maps.score.gain;
+            match self.engine.maps(&mut maps.prior, &mut maps.score) {
+                Ok(()) => maps,
+                Err(error) => {
+                    tracing::warn!(%error, "the last frame's maps are gone");
+                    Maps::default()
+                }
+            }
+        })
+    }
+
+    pub fn engine(&self) -> &Engine {
+        &self.engine
     }
 
     /// Compares a frame with the memory and learns it.
@@ -136,21 +177,23 @@ impl Pipeline {
             Some(camera) => std::mem::take(camera),
             None => Camera::default(),
         };
-        let mut report = self.look(frame, &mut camera.visit);
-        let id = self.remember(frame, &report.world_from_camera);
-        camera.visit.wrote(id);
-        camera
-            .follower
-            .follow(&mut report.regions, &mut self.last_region_id);
+        let looked = self.look(frame, &mut camera.visit, true).map(|mut report| {
+            let id = self.remember(frame, &report.world_from_camera);
+            camera.visit.wrote(id);
+            camera
+                .follower
+                .follow(&mut report.regions, &mut self.last_region_id);
+            report.learned = true;
+            report.viewpoint_id = Some(id);
+            report
+        });
         match self.cameras.get_mut(&frame.source) {
             Some(slot) => *slot = camera,
             None => {
                 self.cameras.insert(frame.source.clone(), camera);
             }
         }
-        report.learned = true;
-        report.viewpoint_id = Some(id);
-        Ok(report)
+        looked
     }
 
     /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
@@ -183,6 +226,9 @@ impl Pipeline {
             &self.settings,
         );
         let (id, old) = self.memory.replace(slot, viewpoint);
+        let written = self.memory.viewpoints().iter().find(|view| view.id == id);
+        self.engine
+            .remember(written.expect("it was written just now"));
         if let Some(old) = old {
             work.mesh = old.mesh;
             work.coarse = old.coarse;
@@ -201,7 +247,7 @@ impl Pipeline {
         let mut visit = camera
             .map(|camera| camera.visit.clone())
             .unwrap_or_default();
-        Ok(self.look(frame, &mut visit))
+        self.look(frame, &mut visit, false)
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
@@ -224,7 +270,12 @@ impl Pipeline {
     }
 
     /// Compares a checked frame with what is expected; nothing is learnt yet.
-    fn look(&mut self, frame: &Frame, visit: &mut Visit) -> Report {
+    fn look(
+        &mut self,
+        frame: &Frame,
+        visit: &mut Visit,
+        learn: bool,
+    ) -> Result<Report, FrameError> {
         let mut work = std::mem::take(&mut self.workspace);
         let mut maps = std::mem::take(&mut self.maps);
         self.engine.observe(&frame.image, &mut work.observation);
@@ -237,21 +288,33 @@ impl Pipeline {
         visit.select(&used);
 
         let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
-        self.engine.recall(
-            &views,
-            &frame.intrinsics,
-            &world_from_camera,
-            &mut maps.prior,
-        );
-        self.engine
-            .score(&maps.prior, &work.observation, &mut maps.score);
+        let question = Question {
+            views: &views,
+            intrinsics: &frame.intrinsics,
+            world_from_camera: &world_from_camera,
+            image: &frame.image,
+            observation: &work.observation,
+        };
+        let answer = Answer {
+            prior: &mut maps.prior,
+            score: &mut maps.score,
+            evidence: &mut maps.evidence,
+            blocks: &mut work.blocks,
+        };
+        let compared = self
+            .engine
+            .compare(&question, self.settings.evidence, learn, answer);
+        self.whole_maps.take();
+        let compared = match compared {
+            Ok(compared) => compared,
+            Err(error) => {
+                self.workspace = work;
+                self.maps_read = true;
+                return Err(FrameError::Engine(error.to_string()));
+            }
+        };
         maps.intrinsics = Some(frame.intrinsics);
-        maps.evidence.find(
-            &maps.score.surprise,
-            frame.intrinsics.width,
-            self.settings.evidence,
-            &mut work.blocks,
-        );
+        self.maps_read = compared.maps_read;
 
         let scene = Scene {
             depth_m: &work.depth_m,
@@ -266,11 +329,6 @@ impl Pipeline {
             sum += f64::from(value);
             max = max.max(value);
         }
-        let seen = maps
-            .prior
-            .plane(prior::COVERAGE)
-            .filter(|&c| c > 0.0)
-            .count();
         let report = Report {
             source: frame.source.clone(),
             stamp_ns: frame.stamp_ns,
@@ -281,7 +339,7 @@ impl Pipeline {
             regions,
             max_surprise: max,
             mean_surprise: (sum / count.max(1) as f64) as f32,
-            coverage: seen as f32 / frame.intrinsics.pixels() as f32,
+            coverage: compared.seen as f32 / frame.intrinsics.pixels() as f32,
             learned: false,
             viewpoint_id: None,
             viewpoints_used: used,
@@ -290,7 +348,7 @@ impl Pipeline {
         };
         self.maps = maps;
         self.workspace = work;
-        report
+        Ok(report)
     }
 
     fn refine(

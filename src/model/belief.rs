@@ -54,7 +54,7 @@ impl BeliefLanes {
 ///
 /// Fixed point for tau, because f16 at grey level 200 would change the surprise by 11 %. Luminance is stored around 128,
 /// because an observation divided by the exposure gain reaches 255 / 0.7.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, bytemuck::Pod, bytemuck::Zeroable)]
 #[repr(C, align(32))]
 pub struct Record {
     pub spread: [u16; 8],

@@ -165,6 +165,8 @@ pub enum FrameError {
         max_m: f32,
         median_m: f32,
     },
+    #[error("the frame could not be computed: {0}")]
+    Engine(String),
 }
 
 impl FrameError {
@@ -177,6 +179,7 @@ impl FrameError {
             Self::DepthSize { .. } => "depth_size",
             Self::NoDepth { .. } => "no_depth",
             Self::DepthUnit { .. } => "depth_unit",
+            Self::Engine(_) => "engine",
         }
     }
 }

@@ -76,7 +76,8 @@ impl CameraPublisher {
         sent(self.reports.put(encode::bytes(report)).wait());
     }
 
-    pub fn maps(&self, report: &Report, maps: &Maps) {
+    /// `maps` is asked only if somebody wants one.
+    pub fn maps<'a>(&self, report: &Report, maps: impl Fn() -> &'a Maps) {
         for (publisher, encode) in &self.maps {
             if !publisher
                 .matching_status()
@@ -88,7 +89,7 @@ impl CameraPublisher {
             let image = StampedImage {
                 stamp: Some(encode::timestamp(report.stamp_ns)),
                 sequence: report.sequence,
-                image: Some(encode(maps)),
+                image: Some(encode(maps())),
             };
             sent(publisher.put(encode::bytes(&image)).wait());
         }

@@ -270,7 +270,7 @@ impl Desk {
         self.maps_of = Some(source.clone());
         let message = encode::report(&report, &self.worker.place, processing_seconds);
         camera.publisher.report(&message);
-        camera.publisher.maps(&report, pipeline.maps());
+        camera.publisher.maps(&report, || pipeline.maps());
         camera.processed(frame.image, lenses, message, frame.stamp_ns);
         if camera.watched(Instant::now()) {
             camera.show(|image| snapshot(pipeline, image));

@@ -11,16 +11,16 @@ use crate::{
     stages::update::UpdateRules,
 };
 
-const DEGREE: usize = 12;
+pub(crate) const DEGREE: usize = 12;
 
 /// The gamma terms `lnG(alpha0) - lnG(alpha) + (alpha - alpha0) psi(alpha)` with `alpha = f alpha0 + 1/2`: they depend on
 /// alpha0 alone, which stays in a short range, so one polynomial serves the three channels.
 #[derive(Debug, Clone)]
 pub struct GammaTerm {
-    center: f32,
-    scale: f32,
+    pub(crate) center: f32,
+    pub(crate) scale: f32,
     /// In `(alpha0 - center) * scale`, lowest power first.
-    coefficients: [f32; DEGREE + 1],
+    pub(crate) coefficients: [f32; DEGREE + 1],
 }
 
 impl GammaTerm {

@@ -2,10 +2,17 @@
 
 use surprised::{
     config::{Settings, UnseenStart},
-    model::belief::{Belief, CHANNELS},
+    model::belief::{Belief, CHANNELS, SPREAD_MAX, SPREAD_MIN},
+    stages::{
+        interpolate::prior::{self, Prior},
+        update::UpdateRules,
+    },
 };
 
-use super::belief::{NormalGamma, Rules, surprise};
+use super::{
+    Random,
+    belief::{NormalGamma, Rules, surprise},
+};
 
 pub type Channels = [NormalGamma; CHANNELS];
 
@@ -153,4 +160,110 @@ pub fn score(
         scored.p2 = 0.0;
     }
     scored
+}
+
+pub fn any_belief(random: &mut Random, rules: &UpdateRules) -> Belief {
+    let (low, high) = rules.alpha_range();
+    let spread = (f64::from(SPREAD_MIN), f64::from(SPREAD_MAX));
+    let extreme = |random: &mut Random, low: f64, high: f64| match random.below(8) {
+        0 => low as f32,
+        1 => high as f32,
+        _ => random.log_uniform(low, high) as f32,
+    };
+    Belief {
+        alpha: extreme(random, low.into(), high.into()),
+        beta: std::array::from_fn(|_| extreme(random, spread.0, spread.1)),
+        tau: any_colour(random),
+        sigma: std::array::from_fn(|_| extreme(random, 0.05, 5.0)),
+        tau2: any_colour(random),
+        p2: 0.0,
+    }
+}
+
+pub fn any_colour(random: &mut Random) -> [f32; CHANNELS] {
+    [
+        random.uniform(0.0, 255.0) as f32,
+        random.uniform(-127.5, 127.5) as f32,
+        random.uniform(-127.5, 127.5) as f32,
+    ]
+}
+
+/// What is expected, close to it, or anything.
+pub fn any_observation(random: &mut Random, prior: &Belief) -> [f32; CHANNELS] {
+    let reach = match random.below(4) {
+        0 => 0.0,
+        1 => 0.1,
+        2 => 5.0,
+        _ => return any_colour(random),
+    };
+    prior
+        .tau
+        .map(|tau| tau + random.uniform(-reach, reach) as f32)
+}
+
+/// Step 4: mean of the squared one-sided differences in x plus that in y, over neighbours that were seen.
+pub fn edge(prior: &Prior, x: usize, y: usize, channel: usize) -> f64 {
+    let at = |x: usize, y: usize, plane: usize| f64::from(prior.row(y).plane(plane)[x]);
+    let mut sum = 0.0;
+    for neighbours in [
+        [(x.wrapping_sub(1), y), (x + 1, y)],
+        [(x, y.wrapping_sub(1)), (x, y + 1)],
+    ] {
+        let squares: Vec<f64> = neighbours
+            .into_iter()
+            .filter(|&(nx, ny)| nx < prior.width && ny < prior.height)
+            .filter(|&(nx, ny)| {
+                at(nx, ny, prior::COVERAGE) > 0.0 && at(x, y, prior::COVERAGE) > 0.0
+            })
+            .map(|(nx, ny)| {
+                (at(x, y, prior::TAU + channel) - at(nx, ny, prior::TAU + channel)).powi(2)
+            })
+            .collect();
+        sum += squares.iter().sum::<f64>() / squares.len().max(1) as f64;
+    }
+    sum
+}
+
+/// Half a step of the stored values on top of the error of single precision.
+pub fn assert_stored(got: &Belief, expected: &Scored, context: &str) {
+    let spread = |got: f32, expected: f64| {
+        let expected = expected.clamp(SPREAD_MIN.into(), SPREAD_MAX.into());
+        let error = (f64::from(got) - expected).abs();
+        let step = 1.0 / 2048.0 + 1e-5;
+        assert!(
+            error <= step * expected,
+            "{got} is not {expected}: {context}"
+        );
+    };
+    let level = |got: f32, expected: f64| {
+        let error = (f64::from(got) - expected).abs();
+        assert!(
+            error <= 0.5 / 128.0 + 1e-3,
+            "{got} is not {expected}: {context}"
+        );
+    };
+    spread(got.alpha, expected.alpha);
+    for c in 0..CHANNELS {
+        spread(got.beta[c], expected.beta[c]);
+        spread(got.sigma[c], expected.sigma[c]);
+        level(got.tau[c], expected.tau[c]);
+        if expected.p2 > 0.0 {
+            level(got.tau2[c], expected.tau2[c]);
+        }
+    }
+    let error = (f64::from(got.p2) - expected.p2).abs();
+    assert!(
+        error < 1e-3,
+        "p2 {} is not {}: {context}",
+        got.p2,
+        expected.p2
+    );
+}
+
+pub fn assert_surprise(got: f32, expected: f64, context: &str) {
+    let error = (f64::from(got) - expected).abs();
+    assert!(
+        error <= 1e-4 * expected.max(0.01),
+        "{got} nats are not {expected}: {context}"
+    );
 }

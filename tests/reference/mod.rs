@@ -10,6 +10,8 @@ pub mod interpolation;
 
 pub mod joint;
 
+pub mod recall;
+
 pub mod scene;
 
 use surprised::isa::Isa;

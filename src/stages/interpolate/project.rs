@@ -106,7 +106,7 @@ pub struct ProjectScratch {
 }
 
 /// Target from view, as [`Projector`] applies it.
-fn homography(
+pub fn homography(
     mesh: &Mesh,
     world_from_view: &Pose,
     target: &Intrinsics,

@@ -1,0 +1,250 @@
+//! The engine on a graphics card: the stages in WGSL (`shaders/`), a twin for each, in one list of passes a frame.
+//!
+//! Viewpoints stay on the device while there is room; the posterior becomes a viewpoint there without a journey. The
+//! processor keeps every viewpoint too, so a lost device loses nothing that was reported. One frame is in flight: its
+//! report is awaited, because the next frame's prior depends on what is learnt.
+//!
+//! Passes a frame: project depth, project triangle, merge, expose, gain, score, block means, and block medians where the
+//! evidence is their median: 8, whatever the number of views. Bytes a frame of P pixels, V views of P pixels:
+//!
+//! | over the bus | bytes | 320x240 |
+//! |---|---|---|
+//! | up: image, and depth of what is learnt | 3 P + 4 P | 0.54 MB |
+//! | up: a view that is not resident | 36 P | 2.76 MB |
+//! | down: evidence, exposure, time stamps | P / 4 + 144 | 19 kB |
+//! | down, if it is learnt: the posterior | 32 P | 2.46 MB |
+//! | down, if something surprises: the map | 4 P | 0.31 MB |
+//! | down, if somebody wants the maps | 100 P | 7.7 MB |
+//!
+//! | within the device | bytes |
+//! |---|---|
+//! | clear, draw and read the maps: 2 x 4 B cleared, written and read; the depth read three times | 36 V P |
+//! | gather: each record once, if neighbours share the cache | 32 V P |
+//! | the prior written, then read by expose (32 B) and score (64 B, neighbours from the cache) | 160 P |
+//! | image read twice, surprise and posterior written, surprise read, posterior copied | 110 P |
+//!
+//! A model, not a measurement: with V = 7 that is 746 P, 57 MB at 320x240 and 229 MB at 640x480. A card of 400 GB/s that
+//! reaches half of it needs 0.3 ms and 1.2 ms; a bus of 12 GB/s adds 0.25 ms and 1.0 ms where everything is learnt.
+
+mod buffers;
+
+mod device;
+
+mod frame;
+
+pub mod layout;
+
+pub mod passes;
+
+pub mod residency;
+
+use std::sync::Arc;
+
+use rayon::ThreadPool;
+
+use self::{
+    device::{Adapters, Device},
+    frame::{Failure, State, Wanted},
+    layout::Rules,
+};
+use super::{
+    Answer, Compared, EngineError, Question, compare_on_processor,
+    cpu::{CpuEngine, RecallView, Score},
+};
+use crate::{
+    config::Settings,
+    isa::Isa,
+    model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
+    stages::interpolate::prior::Prior,
+};
+
+/// What was moved and done, since the engine was made.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Counters {
+    pub frames: u64,
+    /// Frames and recalls that the processor did because the device could not.
+    pub on_processor: u64,
+    pub passes: u64,
+    pub uploaded_bytes: u64,
+    /// For reports and priors; not the maps that somebody wanted.
+    pub read_back_bytes: u64,
+    /// Viewpoints that had to be uploaded, and that had to make room.
+    pub views_brought: u64,
+    pub evicted: u64,
+    pub resident_bytes: u64,
+    /// Devices that were lost and replaced.
+    pub losses: u64,
+    /// Of the last frame, where the device can tell.
+    pub pass_seconds: Vec<(&'static str, f64)>,
+}
+
+pub struct GpuEngine {
+    settings: Settings,
+    rules: Rules,
+    adapters: Adapters,
+    state: State,
+    /// For what does not fit the device.
+    processor: CpuEngine,
+    pool: Arc<ThreadPool>,
+    isa: Isa,
+    counters: Counters,
+}
+
+impl GpuEngine {
+    /// # Errors
+    /// No adapter, or one that gives no device.
+    pub(super) fn new(
+        software_too: bool,
+        settings: &Settings,
+        pool: Arc<ThreadPool>,
+        isa: Isa,
+    ) -> Result<Self, EngineError> {
+        let adapters = if software_too {
+            Adapters::Any
+        } else {
+            Adapters::Real
+        };
+        let rules = Rules::new(settings);
+        Ok(Self {
+            settings: settings.clone(),
+            adapters,
+            state: open(adapters, &rules)?,
+            rules,
+            processor: CpuEngine::new(settings, Arc::clone(&pool), isa),
+            pool,
+            isa,
+            counters: Counters::default(),
+        })
+    }
+
+    /// Name and kind of the adapter.
+    pub fn adapter(&self) -> &str {
+        &self.state.device.adapter
+    }
+
+    pub fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    /// Whether another engine should take over when the device cannot be replaced.
+    pub(super) fn falls_back(&self) -> bool {
+        self.adapters == Adapters::Real
+    }
+
+    pub(super) fn processor(&self) -> &CpuEngine {
+        &self.processor
+    }
+
+    /// The engine that takes over.
+    pub(super) fn fallback(&self) -> CpuEngine {
+        CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
+    }
+
+    /// Gives the device up, as when a driver fails: the next call finds it lost.
+    pub fn destroy_device(&self) {
+        self.state.device.device.destroy();
+    }
+
+    pub(super) fn compare(
+        &mut self,
+        question: &Question,
+        learn: bool,
+        answer: &mut Answer,
+    ) -> Result<Compared, EngineError> {
+        let wanted = Wanted {
+            evidence: self.settings.evidence,
+            posterior: learn,
+            surprise_from: (self.settings.border_px, self.settings.surprise_threshold),
+        };
+        self.counters.frames += 1;
+        let report = self.persevere(|state, counters| {
+            state.compare(
+                question.views,
+                question.intrinsics,
+                question.world_from_camera,
+                question.image,
+                wanted,
+                answer.score,
+                counters,
+            )
+        })?;
+        let Some(report) = report else {
+            self.counters.on_processor += 1;
+            let evidence = self.settings.evidence;
+            return Ok(compare_on_processor(
+                &self.processor,
+                question,
+                evidence,
+                answer,
+            ));
+        };
+        *answer.evidence = report.evidence;
+        Ok(Compared {
+            seen: report.seen,
+            maps_read: false,
+        })
+    }
+
+    pub(super) fn recall(
+        &mut self,
+        views: &[RecallView],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        prior: &mut Prior,
+    ) {
+        let done = self.persevere(|state, counters| {
+            state.recall(views, intrinsics, world_from_camera, prior, counters)
+        });
+        // Whoever asks for a prior gets one, with or without a device.
+        if !matches!(done, Ok(Some(()))) {
+            self.counters.on_processor += 1;
+            self.processor
+                .recall(views, intrinsics, world_from_camera, prior);
+        }
+    }
+
+    pub(super) fn maps(&self, prior: &mut Prior, score: &mut Score) -> Result<(), EngineError> {
+        self.state
+            .maps(prior, score)
+            .map_err(|failure| match failure {
+                Failure::Lost(lost) => EngineError::Lost(lost.0),
+                Failure::TooLarge => unreachable!("maps that were computed fit"),
+            })
+    }
+
+    pub(super) fn remember(&mut self, viewpoint: &Viewpoint) {
+        self.state.remember(viewpoint, &mut self.counters);
+    }
+
+    /// Tries on this device and, if it is lost, on the next; `None`: what was asked does not fit.
+    fn persevere<T>(
+        &mut self,
+        mut attempt: impl FnMut(&mut State, &mut Counters) -> Result<T, Failure>,
+    ) -> Result<Option<T>, EngineError> {
+        let lost = match attempt(&mut self.state, &mut self.counters) {
+            Ok(done) => return Ok(Some(done)),
+            Err(Failure::TooLarge) => return Ok(None),
+            Err(Failure::Lost(lost)) => lost,
+        };
+        self.counters.losses += 1;
+        tracing::warn!(
+            adapter = self.adapter(),
+            reason = lost.0,
+            "the device was lost; opening another"
+        );
+        self.state = open(self.adapters, &self.rules).map_err(|_| EngineError::Lost(lost.0))?;
+        match attempt(&mut self.state, &mut self.counters) {
+            Ok(done) => Ok(Some(done)),
+            Err(Failure::TooLarge) => Ok(None),
+            Err(Failure::Lost(lost)) => Err(EngineError::Lost(lost.0)),
+        }
+    }
+}
+
+fn open(adapters: Adapters, rules: &Rules) -> Result<State, EngineError> {
+    match Device::open(adapters) {
+        Ok(Some(device)) => Ok(State::new(device, rules)),
+        Ok(None) => Err(EngineError::NoAdapter),
+        Err(lost) => Err(EngineError::Lost(lost.0)),
+    }
+}

@@ -1,0 +1,219 @@
+//! The passes and what each of them binds: the table that the pipelines are made from, and that a test holds against
+//! the shaders.
+
+/// A buffer that passes share. Its name is that of the variable in the shaders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Slot {
+    Frame,
+    Rules,
+    Views,
+    DepthArena,
+    RecordArena,
+    Nearest,
+    Triangles,
+    PriorSpread,
+    PriorLevel,
+    PriorSigma,
+    PriorEarlier,
+    Image,
+    Histogram,
+    Exposure,
+    SurpriseMap,
+    PosteriorRecords,
+    BlockMeans,
+    BlockMedians,
+}
+
+impl Slot {
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Frame => "frame",
+            Self::Rules => "rules",
+            Self::Views => "views",
+            Self::DepthArena => "depth_arena",
+            Self::RecordArena => "record_arena",
+            Self::Nearest => "nearest",
+            Self::Triangles => "triangles",
+            Self::PriorSpread => "prior_spread",
+            Self::PriorLevel => "prior_level",
+            Self::PriorSigma => "prior_sigma",
+            Self::PriorEarlier => "prior_earlier",
+            Self::Image => "image",
+            Self::Histogram => "histogram",
+            Self::Exposure => "exposure",
+            Self::SurpriseMap => "surprise_map",
+            Self::PosteriorRecords => "posterior_records",
+            Self::BlockMeans => "block_means",
+            Self::BlockMedians => "block_medians",
+        }
+    }
+}
+
+/// An entry point of a shader.
+#[derive(Debug)]
+pub struct Pass {
+    pub label: &'static str,
+    pub source: &'static str,
+    pub entry: &'static str,
+    pub workgroup: [u32; 3],
+    /// Binding numbers of group 0.
+    pub bindings: &'static [(u32, Slot)],
+}
+
+macro_rules! shader {
+    ($($file:literal),*) => {
+        concat!($(include_str!(concat!("../../../shaders/", $file)), "\n"),*)
+    };
+}
+
+const PROJECT: &str = shader!("layout.wgsl", "project.wgsl", "passes/project.wgsl");
+const MERGE: &str = shader!(
+    "layout.wgsl",
+    "belief.wgsl",
+    "project.wgsl",
+    "merge.wgsl",
+    "passes/merge.wgsl"
+);
+const EXPOSURE: &str = shader!(
+    "layout.wgsl",
+    "belief.wgsl",
+    "image.wgsl",
+    "exposure.wgsl",
+    "passes/exposure.wgsl"
+);
+const SCORE: &str = shader!(
+    "layout.wgsl",
+    "lanes.wgsl",
+    "belief.wgsl",
+    "image.wgsl",
+    "update.wgsl",
+    "surprise.wgsl",
+    "score.wgsl",
+    "passes/score.wgsl"
+);
+const ATTEND: &str = shader!("layout.wgsl", "attend.wgsl", "passes/attend.wgsl");
+
+const DRAWN: &[(u32, Slot)] = &[
+    (0, Slot::Frame),
+    (2, Slot::Views),
+    (3, Slot::DepthArena),
+    (4, Slot::Nearest),
+    (5, Slot::Triangles),
+];
+
+/// One invocation a quad and view.
+pub const PROJECT_DEPTH: usize = 0;
+pub const PROJECT_TRIANGLE: usize = 1;
+/// One a pixel.
+pub const MERGE_VIEWS: usize = 2;
+/// One for [`EXPOSE_PIXELS`] pixels.
+pub const EXPOSE: usize = 3;
+/// One workgroup.
+pub const GAIN: usize = 4;
+/// One a pixel.
+pub const SCORE_PIXELS: usize = 5;
+/// One a block.
+pub const BLOCK_MEANS: usize = 6;
+pub const BLOCK_MEDIANS: usize = 7;
+
+/// Pixels of one invocation of [`EXPOSE`].
+pub const EXPOSE_PIXELS: u32 = 32;
+/// Bins of the histogram, and the count of the seen pixels.
+pub const HISTOGRAM_WORDS: u64 = 2048 + 1;
+
+/// In the order of a frame's way.
+pub const PASSES: [Pass; 8] = [
+    Pass {
+        label: "project depth",
+        source: PROJECT,
+        entry: "project_depth",
+        workgroup: [8, 8, 1],
+        bindings: DRAWN,
+    },
+    Pass {
+        label: "project triangle",
+        source: PROJECT,
+        entry: "project_triangle",
+        workgroup: [8, 8, 1],
+        bindings: DRAWN,
+    },
+    Pass {
+        label: "merge",
+        source: MERGE,
+        entry: "merge",
+        workgroup: [8, 8, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (1, Slot::Rules),
+            (2, Slot::Views),
+            (3, Slot::DepthArena),
+            (4, Slot::RecordArena),
+            (5, Slot::Nearest),
+            (6, Slot::Triangles),
+            (7, Slot::PriorSpread),
+            (8, Slot::PriorLevel),
+            (9, Slot::PriorSigma),
+            (10, Slot::PriorEarlier),
+        ],
+    },
+    Pass {
+        label: "expose",
+        source: EXPOSURE,
+        entry: "expose",
+        workgroup: [256, 1, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (2, Slot::PriorLevel),
+            (3, Slot::PriorEarlier),
+            (4, Slot::Image),
+            (5, Slot::Histogram),
+        ],
+    },
+    Pass {
+        label: "gain",
+        source: EXPOSURE,
+        entry: "gain",
+        workgroup: [256, 1, 1],
+        bindings: &[(1, Slot::Rules), (5, Slot::Histogram), (6, Slot::Exposure)],
+    },
+    Pass {
+        label: "score",
+        source: SCORE,
+        entry: "score",
+        workgroup: [8, 8, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (1, Slot::Rules),
+            (2, Slot::Exposure),
+            (3, Slot::PriorSpread),
+            (4, Slot::PriorLevel),
+            (5, Slot::PriorSigma),
+            (6, Slot::PriorEarlier),
+            (7, Slot::Image),
+            (8, Slot::SurpriseMap),
+            (9, Slot::PosteriorRecords),
+        ],
+    },
+    Pass {
+        label: "block means",
+        source: ATTEND,
+        entry: "means",
+        workgroup: [8, 8, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (1, Slot::SurpriseMap),
+            (2, Slot::BlockMeans),
+        ],
+    },
+    Pass {
+        label: "block medians",
+        source: ATTEND,
+        entry: "median",
+        workgroup: [8, 8, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (2, Slot::BlockMeans),
+            (3, Slot::BlockMedians),
+        ],
+    },
+];
