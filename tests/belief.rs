@@ -4,7 +4,7 @@ mod reference;
 
 use reference::{
     Random, isas,
-    joint::{self, any_belief, any_colour, any_observation, assert_stored, assert_surprise, edge},
+    joint::{self, any_belief, any_observation, assert_stored, assert_surprise, edge},
     pool,
 };
 use surprised::{

@@ -99,12 +99,15 @@ impl FromStr for Ball {
     }
 }
 
+/// In place of a folder; figures are named after it.
+const SIMULATED: &str = "simulated";
+
 /// The paper's sequence I1 as its robot records it, in a folder that goes when it is dropped.
 fn simulate(seed: u64) -> anyhow::Result<TempDir> {
     let folder = tempfile::tempdir().context("no temporary folder can be made")?;
     let script = Script::tabletop(seed);
     let options = write::Options::whole(&script, u64::MAX);
-    write::recording(folder.path(), &script, &options)?;
+    write::recording(&folder.path().join(SIMULATED), &script, &options)?;
     Ok(folder)
 }
 
@@ -148,10 +151,13 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         .as_deref()
         .context("name a recording to evaluate, or --depth")?;
     // Dropped, and so removed, at the end.
-    let simulated = (dir == Path::new("simulated"))
+    let simulated = (dir == Path::new(SIMULATED))
         .then(|| simulate(arguments.seed))
         .transpose()?;
-    let recordings = dataset::open(simulated.as_ref().map_or(dir, |folder| folder.path()))?;
+    let recordings = match &simulated {
+        Some(folder) => dataset::open(&folder.path().join(SIMULATED))?,
+        None => dataset::open(dir)?,
+    };
     if let Some(folder) = &arguments.figures {
         fs::create_dir_all(folder).with_context(|| format!("cannot make {}", folder.display()))?;
     }

@@ -4,6 +4,7 @@ use std::{net::SocketAddr, path::PathBuf};
 
 use crate::{
     config::{ConfigError, Preset, Settings},
+    engine::EngineKind,
     service::{self, session::ZenohOptions},
 };
 
@@ -44,6 +45,9 @@ impl SettingsOptions {
 pub struct ServiceOptions {
     #[command(flatten)]
     pub settings: SettingsOptions,
+    /// Where recall and surprise are computed.
+    #[arg(long, value_enum, default_value_t)]
+    pub engine: EngineKind,
     /// Address to serve HTTP on; off for none.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", value_parser = http)]
     pub http: Http,
@@ -60,6 +64,7 @@ impl ServiceOptions {
     pub fn options(self) -> Result<service::Options, ConfigError> {
         Ok(service::Options {
             settings: self.settings.settings()?,
+            engine: self.engine,
             root: self.root,
             http: self.http.0,
             zenoh: self.zenoh,

@@ -81,6 +81,7 @@ pub struct Compared {
     pub maps_read: bool,
 }
 
+#[expect(clippy::large_enum_variant, reason = "a place has one")]
 pub enum Engine {
     Cpu(CpuEngine),
     Gpu(Box<GpuEngine>),

@@ -42,6 +42,8 @@ use self::{
 };
 use crate::{
     config::{ConfigError, Settings},
+    engine::{Engine, EngineError, EngineKind},
+    isa::Isa,
     wire::{decode::Limits, keys},
 };
 
@@ -52,6 +54,7 @@ const STOP_WITHIN: Duration = Duration::from_secs(5);
 #[derive(Debug, Clone)]
 pub struct Options {
     pub settings: Settings,
+    pub engine: EngineKind,
     pub root: String,
     /// `None`: no HTTP.
     pub http: Option<SocketAddr>,
@@ -71,6 +74,8 @@ pub enum ServeError {
     },
     #[error("threads cannot be started: {0}")]
     Threads(String),
+    #[error(transparent)]
+    Engine(#[from] EngineError),
     #[error("the worker of place {0} failed: this is a bug; its panic is in the log above")]
     Worker(String),
     #[error("the service did not stop within {} s", STOP_WITHIN.as_secs())]
@@ -104,6 +109,7 @@ impl Service {
     pub async fn start(options: Options) -> Result<Self, ServeError> {
         let Options {
             settings,
+            engine,
             root,
             http,
             zenoh,
@@ -134,12 +140,17 @@ impl Service {
             .thread_name(|index| format!("engine {index}"))
             .build()
             .map_err(|error| ServeError::Threads(error.to_string()))?;
+        let pool = Arc::new(pool);
+        if engine == EngineKind::Gpu {
+            // Each place opens its own device; that there is one is known before anything is promised.
+            Engine::new(engine, &settings, pool.clone(), Isa::detect())?;
+        }
         let session = zenoh::open(config).await.map_err(ServeError::Zenoh)?;
         let locators = session::locators(&session);
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let (places, starts) = Places::new(settings, root.into(), session, Arc::new(pool), failed);
+        let (places, starts) = Places::new(settings, engine, root.into(), session, pool, failed);
         let places = Arc::new(places);
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
         let queryable =

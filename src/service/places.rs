@@ -12,7 +12,14 @@ use tokio::sync::{mpsc, watch};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use super::{inbox::Inbox, ingest, status::PlaceStatus, worker::Worker};
-use crate::{config::Settings, model::refusal::Refusal, pipeline::Pipeline, wire::keys};
+use crate::{
+    config::Settings,
+    engine::{Engine, EngineKind},
+    isa::Isa,
+    model::refusal::Refusal,
+    pipeline::Pipeline,
+    wire::keys,
+};
 
 /// Each is a thread and a memory of up to `memory_bytes`.
 pub const PLACES_MAX: usize = 16;
@@ -28,6 +35,7 @@ pub struct Place {
 
 pub struct Places {
     pub settings: Settings,
+    engine: EngineKind,
     pub root: Arc<str>,
     pub session: Session,
     pool: Arc<ThreadPool>,
@@ -49,6 +57,7 @@ pub type Starts = mpsc::Receiver<Arc<str>>;
 impl Places {
     pub fn new(
         settings: Settings,
+        engine: EngineKind,
         root: Arc<str>,
         session: Session,
         pool: Arc<ThreadPool>,
@@ -57,6 +66,7 @@ impl Places {
         let (starts, started) = mpsc::channel(PLACES_MAX);
         let places = Self {
             settings,
+            engine,
             root,
             session,
             pool,
@@ -145,12 +155,15 @@ impl Places {
         };
         let token = keys::live_service(&self.root, name, &self.session.zid().to_string());
         let token = self.session.liveliness().declare_token(token).wait()?;
+        let isa = Isa::detect();
+        let engine = Engine::new(self.engine, &self.settings, self.pool.clone(), isa)?;
+        let pipeline = Pipeline::with_engine(self.settings.clone(), self.pool.clone(), isa, engine);
         let worker = Worker {
             place: name.clone(),
             root: self.root.clone(),
             session: self.session.clone(),
             inbox: place.inbox.clone(),
-            pipeline: Pipeline::new(self.settings.clone(), self.pool.clone()),
+            pipeline,
             status,
             ask_calibration: ingest::calibration_getter(
                 self.session.clone(),

@@ -4,6 +4,7 @@ use std::{future::Future, net::SocketAddr, time::Duration};
 
 use surprised::{
     config::{Preset, Settings},
+    engine::EngineKind,
     model::{
         camera::{Calibration, Intrinsics},
         frame::{DepthSource, Frame, RgbImage, Source},
@@ -50,6 +51,7 @@ impl Rig {
         let settings: Vec<String> = settings.iter().map(|&pair| pair.to_owned()).collect();
         let alone = ["scouting/gossip/enabled:false".to_owned()];
         let service = Service::start(Options {
+            engine: EngineKind::Cpu,
             settings: Settings::layered(Preset::Robust, None, &settings).expect("good settings"),
             root: "test/surprised".to_owned(),
             http: Some(([127, 0, 0, 1], 0).into()),
