@@ -1,7 +1,11 @@
 //! Every setting of the science and the service: unit, default, bound, reason. A preset gives all of them; a file and
 //! `--set name=value` change single ones; the whole is validated before anything opens.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
+
+use crate::model::pose::PoseNoise;
 
 /// Which defaults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -44,6 +48,14 @@ pub enum Evidence {
     BlockMedian,
 }
 
+/// What is set for one robot; what is not is as for all.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotSettings {
+    pub pose_position_sd_m: Option<f64>,
+    pub pose_rotation_sd_rad: Option<f64>,
+}
+
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Settings {
@@ -73,6 +85,10 @@ pub struct Settings {
     /// 2 mm and 0.2 degrees are assumed in any case: less lets refinement trust a tracker too much.
     pub pose_position_sd_m: f64,
     pub pose_rotation_sd_rad: f64,
+
+    /// The same for single robots, by their name: `--set robots.NAME.pose_position_sd_m=0.01`.
+    #[serde(default)]
+    pub robots: BTreeMap<String, RobotSettings>,
 
     /// Views whose depth is far from the median are outvoted (step 2a).
     pub depth_vote: bool,
@@ -180,6 +196,7 @@ impl Settings {
             refine_pose: true,
             pose_position_sd_m: 0.002,
             pose_rotation_sd_rad: 0.2_f64.to_radians(),
+            robots: BTreeMap::new(),
             depth_vote: true,
             depth_vote_tolerance: 0.03,
             colour_vote: true,
@@ -231,8 +248,11 @@ impl Settings {
                 .split_once('=')
                 .ok_or_else(|| ConfigError::Pair(pair.clone()))?;
             let (name, value) = (name.trim(), value.trim());
-            let Some(default) = table.get(name) else {
-                return Err(ConfigError::Unknown(name.to_owned()));
+            let slot = match name.strip_prefix("robots.").and_then(|n| n.split_once('.')) {
+                None => table.entry(name.to_owned()),
+                Some((robot, of_robot)) => robot_table(&mut table, robot)
+                    .ok_or_else(|| ConfigError::Unknown(name.to_owned()))?
+                    .entry(of_robot.to_owned()),
             };
             // A bare word is a string and `3` is good enough for `3.0`, as a person would type it.
             let parsed = format!("value = {value}")
@@ -240,17 +260,38 @@ impl Settings {
                 .ok()
                 .and_then(|mut parsed| parsed.remove("value"))
                 .unwrap_or_else(|| toml::Value::String(value.to_owned()));
-            let parsed = match (default, parsed) {
-                (toml::Value::Float(_), toml::Value::Integer(whole)) => {
-                    toml::Value::Float(whole as f64)
+            let is_float = |known: &toml::Value| known.is_float();
+            match (slot, parsed) {
+                (toml::map::Entry::Vacant(_), _) if !name.starts_with("robots.") => {
+                    return Err(ConfigError::Unknown(name.to_owned()));
                 }
-                (_, parsed) => parsed,
-            };
-            table.insert(name.to_owned(), parsed);
+                (toml::map::Entry::Vacant(slot), parsed) => {
+                    slot.insert(parsed);
+                }
+                (toml::map::Entry::Occupied(mut slot), toml::Value::Integer(whole))
+                    if is_float(slot.get()) =>
+                {
+                    slot.insert(toml::Value::Float(whole as f64));
+                }
+                (toml::map::Entry::Occupied(mut slot), parsed) => {
+                    slot.insert(parsed);
+                }
+            }
         }
         let settings: Self = table.try_into().map_err(ConfigError::File)?;
         settings.validate()?;
         Ok(settings)
+    }
+
+    /// The pose noise of a robot whose frames do not say.
+    pub fn pose_noise(&self, robot: &str) -> PoseNoise {
+        let own = self.robots.get(robot).copied().unwrap_or_default();
+        PoseNoise {
+            position_m: own.pose_position_sd_m.unwrap_or(self.pose_position_sd_m),
+            rotation_rad: own
+                .pose_rotation_sd_rad
+                .unwrap_or(self.pose_rotation_sd_rad),
+        }
     }
 
     /// # Errors
@@ -306,8 +347,26 @@ impl Settings {
         )?;
         within("pose_wait_s", self.pose_wait_s, 0.0, 10.0)?;
         within("pull_hz", self.pull_hz, 0.0, 1000.0)?;
+        for robot in self.robots.values() {
+            let position_sd_m = robot.pose_position_sd_m.unwrap_or(0.0);
+            within("robots.*.pose_position_sd_m", position_sd_m, 0.0, 1.0)?;
+            let rotation_sd_rad = robot.pose_rotation_sd_rad.unwrap_or(0.0);
+            within("robots.*.pose_rotation_sd_rad", rotation_sd_rad, 0.0, 1.0)?;
+        }
         within("threads", self.threads, 0, 1024)
     }
+}
+
+/// The settings of one robot, made if there are none yet; `None` where something else stands in their place.
+fn robot_table<'a>(settings: &'a mut toml::Table, robot: &str) -> Option<&'a mut toml::Table> {
+    let empty = || toml::Value::Table(toml::Table::new());
+    settings
+        .entry("robots")
+        .or_insert_with(empty)
+        .as_table_mut()?
+        .entry(robot)
+        .or_insert_with(empty)
+        .as_table_mut()
 }
 
 #[derive(Debug, thiserror::Error)]

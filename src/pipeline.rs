@@ -18,7 +18,7 @@ use crate::{
         belief::Record,
         camera::Intrinsics,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
-        pose::{Pose, PoseNoise},
+        pose::Pose,
         report::Report,
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
@@ -361,10 +361,9 @@ impl Pipeline {
         if !self.settings.refine_pose {
             return Refined::unchanged(frame.world_from_camera);
         }
-        let noise = frame.pose_noise.unwrap_or(PoseNoise {
-            position_m: self.settings.pose_position_sd_m,
-            rotation_rad: self.settings.pose_rotation_sd_rad,
-        });
+        let noise = frame
+            .pose_noise
+            .unwrap_or_else(|| self.settings.pose_noise(&frame.source.robot));
         self.select(&frame.world_from_camera, selected);
         selected.truncate(REFINE_VIEWS);
         let recalled = recall_views(&self.memory, &self.settings, selected, visit);
