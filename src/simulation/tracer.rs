@@ -436,14 +436,18 @@ impl Tracer<'_> {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         let hit = self.first(&path.ray, tile);
+                        // What the pixel or one beside it shows of the same face: its texture and light are averaged
+                        // over a pixel already, and do not differ much. Glass is looked through again.
                         let known = hit.and_then(|hit| {
                             around
                                 .into_iter()
                                 .flatten()
-                                .map(|there| lit[there])
-                                .find(|lit| lit.face == (hit.primitive, hit.crossing.part))
+                                .find(|&there| lit[there].face == (hit.primitive, hit.crossing.part))
                         });
-                        let colour = self.shade(&path, hit.as_ref(), known, Some(tile), scratch);
+                        let colour = known.map_or_else(
+                            || self.shade(&path, hit.as_ref(), None, Some(tile), scratch),
+                            |there| first[there],
+                        );
                         sum = plus(sum, scaled(colour, 0.25));
                     }
                     *radiance = sum;
