@@ -3,7 +3,7 @@
 //! left out, glass only dims it.
 //!
 //! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
-//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get three more for colour.
+//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get two more for colour.
 
 use std::ops::Range;
 
@@ -30,7 +30,7 @@ const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
 /// Mirrored light of a smaller part in the pixel is taken from the room at large.
-const FAINT: f32 = 0.045;
+const FAINT: f32 = 0.06;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
 /// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
@@ -437,10 +437,8 @@ impl Tracer<'_> {
                         (row + 1 < camera.height).then_some(here + width),
                     ];
                     let tile = &bands[row / TILE][column / TILE];
-                    let mut sum = scaled(*radiance, 0.25);
-                    for (index, (du, dv)) in [(-0.36, -0.12), (0.08, 0.37), (0.28, -0.25)]
-                        .into_iter()
-                        .enumerate()
+                    let mut sum = scaled(*radiance, 1.0 / 3.0);
+                    for (index, (du, dv)) in [(-0.34, 0.17), (0.17, -0.34)].into_iter().enumerate()
                     {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
@@ -456,7 +454,7 @@ impl Tracer<'_> {
                             || self.shade(&path, hit.as_ref(), None, Some(tile), scratch),
                             |there| first[there],
                         );
-                        sum = plus(sum, scaled(colour, 0.25));
+                        sum = plus(sum, scaled(colour, 1.0 / 3.0));
                     }
                     *radiance = sum;
                 }
