@@ -118,6 +118,8 @@ pub struct Frustum {
     height: f64,
     base_radius: f64,
     top_radius: f64,
+    /// Of the radius, for each metre along the axis.
+    taper: f64,
     closed_base: bool,
     closed_top: bool,
     right: Vector3<f64>,
@@ -142,6 +144,7 @@ impl Frustum {
             height,
             base_radius,
             top_radius,
+            taper: (top_radius - base_radius) / height,
             closed_base: false,
             closed_top: false,
             right,
@@ -182,7 +185,7 @@ pub struct Disc {
 /// A convex solid between planes.
 #[derive(Debug, Clone)]
 pub struct Solid {
-    /// Outward normal and offset: inside is `normal . p <= offset`.
+    /// Outward normal and offset: inside is `normal . p <= offset`. The first six are three pairs of opposite faces.
     planes: Vec<(Vector3<f64>, f64)>,
     origin: Point3<f64>,
     right: Vector3<f64>,
@@ -313,7 +316,34 @@ impl Shape {
             Self::Solid(solid) => {
                 let (mut enter, mut leave) = (f64::NEG_INFINITY, f64::INFINITY);
                 let (mut enter_part, mut leave_part) = (0, 0);
-                for (part, (normal, offset)) in solid.planes.iter().enumerate() {
+                let (slabs, slopes) = solid.planes.split_at(6);
+                for (slab, planes) in slabs.chunks_exact(2).enumerate() {
+                    let (normal, above) = planes[0];
+                    let below = -planes[1].1;
+                    let slope = normal.dot(&ray.direction);
+                    let height = normal.dot(&ray.origin.coords);
+                    if slope == 0.0 {
+                        if height > above || height < below {
+                            return None;
+                        }
+                        continue;
+                    }
+                    let inverse = slope.recip();
+                    let (up, down) = ((above - height) * inverse, (below - height) * inverse);
+                    let rising = slope > 0.0;
+                    let (near, far) = if rising { (down, up) } else { (up, down) };
+                    if near > enter {
+                        (enter, enter_part) = (near, 2 * slab + usize::from(rising));
+                    }
+                    if far < leave {
+                        (leave, leave_part) = (far, 2 * slab + usize::from(!rising));
+                    }
+                    if enter > leave {
+                        return None;
+                    }
+                }
+                for (part, (normal, offset)) in slopes.iter().enumerate() {
+                    let part = part + 6;
                     let slope = normal.dot(&ray.direction);
                     let distance = offset - normal.dot(&ray.origin.coords);
                     if slope == 0.0 {
@@ -432,22 +462,22 @@ impl Frustum {
         let beside = from_base - self.axis * height;
         let across = ray.direction - self.axis * climb;
         // |beside + t across|^2 = (radius + t widening)^2
-        let taper = (self.top_radius - self.base_radius) / self.height;
-        let radius = self.base_radius + taper * height;
-        let widening = taper * climb;
+        let radius = self.base_radius + self.taper * height;
+        let widening = self.taper * climb;
         let within = |t: f64| {
             let z = height + t * climb;
             (0.0..=self.height).contains(&z)
         };
-        let side = first_root(
+        let (a, b, c) = (
             across.norm_squared() - widening * widening,
             beside.dot(&across) - radius * widening,
             beside.norm_squared() - radius * radius,
-            t_min,
-            t_max,
-            within,
-        )
-        .map(|t| Crossing { t, part: 0 });
+        );
+        // Never within the whole cone, so within neither lid.
+        if a > 0.0 && b * b < a * c {
+            return None;
+        }
+        let side = first_root(a, b, c, t_min, t_max, within).map(|t| Crossing { t, part: 0 });
         let lid = |closed: bool, level: f64, lid_radius: f64, part: usize| {
             if !closed {
                 return None;
@@ -481,10 +511,9 @@ impl Frustum {
                 part,
             };
         }
-        let taper = (self.top_radius - self.base_radius) / self.height;
         let outward = (self.right * x + self.forward * y) / x.hypot(y);
         Surface {
-            normal: (outward - self.axis * taper).normalize(),
+            normal: (outward - self.axis * self.taper).normalize(),
             u: y.atan2(x) * 0.5 * (self.base_radius + self.top_radius),
             v: height,
             part,

@@ -227,17 +227,22 @@ impl Pattern {
                     let du = u - (column + 0.3 + f64::from(chosen) * 0.4) * 0.07;
                     let dv = v - (row + 0.5) * 0.07;
                     let radius = (du * du + dv * dv).sqrt();
-                    let petal = 0.009 + 0.004 * (5.0 * dv.atan2(du)).cos();
-                    let figure = 1.0 - above(radius, petal, footprint);
-                    let heart = 1.0 - above(radius, 0.004, footprint);
-                    let thread = mixed(*warp, rgb(0xc98a2b), f32::from(chosen > 0.78));
-                    mixed(mixed(colour, thread, figure * 0.9), rgb(0xf4e3b0), heart)
+                    // Beyond its longest petals there is nothing of it.
+                    if radius < 0.013 + footprint {
+                        let petal = 0.009 + 0.004 * (5.0 * dv.atan2(du)).cos();
+                        let figure = 1.0 - above(radius, petal, footprint);
+                        let heart = 1.0 - above(radius, 0.004, footprint);
+                        let thread = mixed(*warp, rgb(0xc98a2b), f32::from(chosen > 0.78));
+                        mixed(mixed(colour, thread, figure * 0.9), rgb(0xf4e3b0), heart)
+                    } else {
+                        colour
+                    }
                 } else {
                     colour
                 };
                 let grain = 1.0
-                    + 0.10 * clouds(u, v, 0.02, 3, footprint, seed + 2)
-                    + 0.05 * clouds(u, v, 0.2, 2, footprint, seed + 3);
+                    + 0.10 * clouds(u, v, 0.02, 2, footprint, seed + 2)
+                    + 0.05 * clouds(u, v, 0.2, 1, footprint, seed + 3);
                 scaled(colour, grain)
             }
             Self::Planks {
@@ -279,15 +284,25 @@ impl Pattern {
                 };
                 let du = u - (column + 0.5) * 0.16;
                 let dv = v - (row + 0.5) * 0.2 - odd * 0.1;
-                let angle = dv.atan2(du);
-                let radius = du.hypot(dv * 0.8);
-                let tilt = f64::from(hash(column as i64, row as i64, *seed)) * 6.0;
-                let edge = 0.035 + 0.016 * (5.0 * angle + tilt).cos() + 0.006 * (9.0 * angle).sin();
-                let shape = between(radius, 0.012, edge, footprint);
-                let stalk = between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint);
+                let radius = (du * du + 0.64 * dv * dv).sqrt();
+                // Its longest petals reach 57 mm.
+                let shape = if radius < 0.057 + footprint {
+                    let angle = dv.atan2(du);
+                    let tilt = f64::from(hash(column as i64, row as i64, *seed)) * 6.0;
+                    let edge =
+                        0.035 + 0.016 * (5.0 * angle + tilt).cos() + 0.006 * (9.0 * angle).sin();
+                    between(radius, 0.012, edge, footprint)
+                } else {
+                    0.0
+                };
+                let stalk = if du.abs() < 0.015 + footprint {
+                    between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint)
+                } else {
+                    0.0
+                };
                 let colour = mixed(*ground, *figure, (0.75 * shape + 0.4 * stalk).min(0.85));
                 let grain = 1.0
-                    + 0.05 * clouds(u, v, 0.03, 3, footprint, seed + 2)
+                    + 0.05 * clouds(u, v, 0.03, 2, footprint, seed + 2)
                     + 0.09 * clouds(u, v, 0.5, 2, footprint, seed + 3);
                 scaled(colour, grain)
             }

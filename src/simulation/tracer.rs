@@ -3,7 +3,7 @@
 //! left out, glass only dims it.
 //!
 //! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
-//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get three more for colour.
+//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get two more for colour.
 
 use std::ops::Range;
 
@@ -20,17 +20,17 @@ use crate::model::{camera::Intrinsics, pose::Pose};
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
 const MAX_BOUNCES: u32 = 9;
-const LAMP_SAMPLES: usize = 10;
-const SKY_SAMPLES: usize = 6;
+const LAMP_SAMPLES: usize = 9;
+const SKY_SAMPLES: usize = 5;
 /// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
-const FEW_LAMP_SAMPLES: usize = 5;
+const FEW_LAMP_SAMPLES: usize = 4;
 const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
 /// Mirrored light of a smaller part in the pixel is taken from the room at large.
-const FAINT: f32 = 0.045;
+const FAINT: f32 = 0.06;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
 /// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
@@ -140,11 +140,18 @@ const UNLIT: Lit = Lit {
 /// Lamp shares that differ by more are the edge of a shadow, where each pixel is looked at.
 const SHADOW_EDGE: f32 = 0.15;
 
+/// Shares of the lamp and of the sky that differ by less, across a tile, are looked for at few of its points.
+const LEVEL: [f32; 2] = [0.12, 0.16];
+
 /// Pixels that a primitive's bounds cover, columns and rows, and how near they come.
 struct Footprint {
     primitive: usize,
     window: [Range<usize>; 2],
     nearest_m: f64,
+}
+
+fn overlap(a: &Range<usize>, b: &Range<usize>) -> bool {
+    a.start < b.end && b.start < a.end
 }
 
 /// What matters in a square of pixels.
@@ -160,15 +167,13 @@ struct Tile {
 
 impl Tile {
     fn over(
-        prints: &[Footprint],
-        columns: Range<usize>,
-        rows: Range<usize>,
+        band: &[&Footprint],
+        columns: &Range<usize>,
         nearest_m: impl Fn(&Footprint) -> Option<f64>,
     ) -> Self {
-        let overlap = |a: &Range<usize>, b: &Range<usize>| a.start < b.end && b.start < a.end;
-        let mut seen: Vec<_> = prints
+        let mut seen: Vec<_> = band
             .iter()
-            .filter(|print| overlap(&print.window[0], &columns) && overlap(&print.window[1], &rows))
+            .filter(|print| overlap(&print.window[0], columns))
             .filter_map(|print| Some((print.primitive, nearest_m(print)?)))
             .collect();
         seen.sort_by(|a, b| a.1.total_cmp(&b.1));
@@ -356,6 +361,11 @@ impl Tracer<'_> {
                 |scratch, (band, ((((radiance, depth), through), object), lit))| {
                     let top = band * TILE;
                     let height = radiance.len() / width;
+                    let rows = top..top + height;
+                    let band: Vec<_> = prints
+                        .iter()
+                        .filter(|print| overlap(&print.window[1], &rows))
+                        .collect();
                     let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
                     for left in (0..width).step_by(TILE) {
                         let right = (left + TILE).min(width);
@@ -365,14 +375,13 @@ impl Tracer<'_> {
                             left..right,
                             top..top + height,
                         );
-                        let mut tile =
-                            Tile::over(&prints, left..right, top..top + height, |print| {
-                                let primitive = print.primitive;
-                                frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
-                                    let shape = &self.scene.primitives()[primitive].shape;
-                                    frame.nearest_m(shape).max(print.nearest_m)
-                                })
-                            });
+                        let mut tile = Tile::over(&band, &(left..right), |print| {
+                            let primitive = print.primitive;
+                            frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
+                                let shape = &self.scene.primitives()[primitive].shape;
+                                frame.nearest_m(shape).max(print.nearest_m)
+                            })
+                        });
                         let mut seen = Vec::with_capacity(TILE * TILE);
                         for row in 0..height {
                             for column in left..right {
@@ -428,23 +437,24 @@ impl Tracer<'_> {
                         (row + 1 < camera.height).then_some(here + width),
                     ];
                     let tile = &bands[row / TILE][column / TILE];
-                    let mut sum = scaled(*radiance, 0.25);
-                    for (index, (du, dv)) in [(-0.36, -0.12), (0.08, 0.37), (0.28, -0.25)]
-                        .into_iter()
-                        .enumerate()
+                    let mut sum = scaled(*radiance, 1.0 / 3.0);
+                    for (index, (du, dv)) in [(-0.34, 0.17), (0.17, -0.34)].into_iter().enumerate()
                     {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         let hit = self.first(&path.ray, tile);
+                        // What the pixel or one beside it shows of the same face: its texture and light are averaged
+                        // over a pixel already, and do not differ much. Glass is looked through again.
                         let known = hit.and_then(|hit| {
-                            around
-                                .into_iter()
-                                .flatten()
-                                .map(|there| lit[there])
-                                .find(|lit| lit.face == (hit.primitive, hit.crossing.part))
+                            around.into_iter().flatten().find(|&there| {
+                                lit[there].face == (hit.primitive, hit.crossing.part)
+                            })
                         });
-                        let colour = self.shade(&path, hit.as_ref(), known, Some(tile), scratch);
-                        sum = plus(sum, scaled(colour, 0.25));
+                        let colour = known.map_or_else(
+                            || self.shade(&path, hit.as_ref(), None, Some(tile), scratch),
+                            |there| first[there],
+                        );
+                        sum = plus(sum, scaled(colour, 1.0 / 3.0));
                     }
                     *radiance = sum;
                 }
@@ -521,7 +531,8 @@ impl Tracer<'_> {
         });
     }
 
-    /// Finds the light on every point that a tile sees: exactly at every fourth pixel, between them where it matters.
+    /// Finds the light on every point that a tile sees: exactly at every sixteenth pixel, at every fourth where those
+    /// of the tile differ, and between these where the edge of a shadow is.
     fn light(
         &self,
         tile: &Tile,
@@ -530,50 +541,36 @@ impl Tracer<'_> {
         width: usize,
         scratch: &mut Scratch,
     ) {
-        let sparse = |at: usize| (at % width).is_multiple_of(2) && (at / width).is_multiple_of(2);
-        for &(at, ref path, _, hit) in seen.iter().filter(|&&(at, ..)| sparse(at)) {
-            if let Some(hit) = hit {
-                lit[at] = self.light_on(path, &hit, Some(tile), scratch);
-            }
-        }
-        let (first, last) = match (seen.first(), seen.last()) {
-            (Some(first), Some(last)) => (first.0, last.0),
-            _ => return,
+        let Some(&(origin, ..)) = seen.first() else {
+            return;
         };
-        let columns = first % width..=last % width;
-        let rows = first / width..=last / width;
-        for &(at, ref path, _, hit) in seen.iter().filter(|&&(at, ..)| !sparse(at)) {
-            let Some(hit) = hit else {
-                continue;
-            };
-            let face = (hit.primitive, hit.crossing.part);
-            let (column, row) = (at % width, at / width);
-            let (mut count, mut sky, mut low, mut high, mut lamp) = (0.0, 0.0, 1.0f32, 0.0f32, 0.0);
-            for row in row.saturating_sub(1)..=row + 1 {
-                for column in column.saturating_sub(1)..=column + 1 {
-                    let there = row * width + column;
-                    if columns.contains(&column)
-                        && rows.contains(&row)
-                        && sparse(there)
-                        && lit[there].face == face
-                    {
-                        count += 1.0;
-                        sky += lit[there].sky;
-                        lamp += lit[there].lamp;
-                        low = low.min(lit[there].lamp);
-                        high = high.max(lit[there].lamp);
-                    }
+        let place = |at: usize| (at % width - origin % width, at / width - origin / width);
+        let mut known = [[None::<Lit>; TILE]; TILE];
+        for step in [4, 2, 1] {
+            // The coarsest lattice is centred in the tile.
+            let phase = step / 4 * 2;
+            let on_lattice = |i: usize| i % step == phase;
+            let before = known;
+            for &(at, ref path, _, hit) in seen {
+                let (column, row) = place(at);
+                let Some(hit) = hit else {
+                    continue;
+                };
+                if known[row][column].is_some() || !on_lattice(column) || !on_lattice(row) {
+                    continue;
                 }
+                let face = (hit.primitive, hit.crossing.part);
+                let shared = match step {
+                    4 => None,
+                    2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
+                    _ => shared(&before, face, (column, row), 1, 1, [SHADOW_EDGE, 1.0])
+                        .or_else(|| shared(&before, face, (column, row), 2, 3, LEVEL)),
+                };
+                let light =
+                    shared.unwrap_or_else(|| self.light_on(path, &hit, Some(tile), scratch));
+                known[row][column] = Some(light);
+                lit[at] = light;
             }
-            lit[at] = if count > 0.0 && high - low < SHADOW_EDGE {
-                Lit {
-                    face,
-                    sky: sky / count,
-                    lamp: lamp / count,
-                }
-            } else {
-                self.light_on(path, &hit, Some(tile), scratch)
-            };
         }
     }
 
@@ -921,6 +918,42 @@ impl Tracer<'_> {
         }
         seen / SAMPLES as f32
     }
+}
+
+/// Mean light of the points of the same face at most `reach` pixels away, the nearer ones counting more, if there are
+/// `enough` and they differ by less than `lamp_range` and `sky_range`.
+fn shared(
+    known: &[[Option<Lit>; TILE]; TILE],
+    face: (usize, usize),
+    (column, row): (usize, usize),
+    reach: usize,
+    enough: usize,
+    [lamp_range, sky_range]: [f32; 2],
+) -> Option<Lit> {
+    let (mut count, mut weight, mut sky, mut lamp) = (0, 0.0, 0.0, 0.0);
+    let (mut low, mut high) = ([1.0f32; 2], [0.0f32; 2]);
+    for there_row in row.saturating_sub(reach)..(row + reach + 1).min(TILE) {
+        for there_column in column.saturating_sub(reach)..(column + reach + 1).min(TILE) {
+            let Some(lit) = known[there_row][there_column].filter(|lit| lit.face == face) else {
+                continue;
+            };
+            let (across, down) = (there_column.abs_diff(column), there_row.abs_diff(row));
+            let near = 1.0 / (across * across + down * down) as f32;
+            count += 1;
+            weight += near;
+            sky += near * lit.sky;
+            lamp += near * lit.lamp;
+            low = [low[0].min(lit.lamp), low[1].min(lit.sky)];
+            high = [high[0].max(lit.lamp), high[1].max(lit.sky)];
+        }
+    }
+    (count >= enough && high[0] - low[0] < lamp_range && high[1] - low[1] < sky_range).then(|| {
+        Lit {
+            face,
+            sky: sky / weight,
+            lamp: lamp / weight,
+        }
+    })
 }
 
 /// Does a pixel differ from one of its neighbours in surface, or strongly in colour?
