@@ -11,7 +11,7 @@ use crate::simulation::{
 
 const MAX_BOUNCES: u32 = 9;
 /// Mirrored light of a smaller part in the pixel is taken from the room at large.
-const FAINT: f32 = 0.06;
+const FAINT: f32 = 0.045;
 
 /// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
 /// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
