@@ -1,0 +1,384 @@
+//! How much of the lamp and of the sky a point sees.
+//!
+//! In: a point on a surface. Out: two shares, 0..1. Both are sampled; a tile looks for them at as few of its points as
+//! their differences allow.
+
+use nalgebra::{Point3, Vector3};
+
+use super::{
+    LIFT, Path, Scratch, Tracer,
+    tiles::{TILE, Tile},
+};
+use crate::simulation::{
+    scene::{Hit, Light},
+    shapes::{Bounds, Ray},
+};
+
+const LAMP_SAMPLES: usize = 9;
+const SKY_SAMPLES: usize = 5;
+/// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
+const FEW_LAMP_SAMPLES: usize = 4;
+const FEW_SKY_SAMPLES: usize = 3;
+/// Things farther than this do not dim the sky light, metres.
+const SKY_REACH: f64 = 0.26;
+/// Share of light that one pane of glass lets through to what is in its shadow.
+const GLASS_SHADOW: f32 = 0.9;
+/// Of a smaller part in the pixel, shadows are not looked for.
+const WEAK: f32 = 0.3;
+
+/// How much of the sky and of the lamp a point on a surface sees, 0..1. Light changes slowly over a surface, so
+/// neighbouring pixels on the same face of the same primitive share it.
+#[derive(Clone, Copy)]
+pub(super) struct Lit {
+    /// Primitive and part.
+    pub(super) face: (usize, usize),
+    pub(super) sky: f32,
+    pub(super) lamp: f32,
+}
+
+/// Nothing, or glass, which has no light of its own.
+pub(super) const UNLIT: Lit = Lit {
+    face: (usize::MAX, 0),
+    sky: 1.0,
+    lamp: 1.0,
+};
+
+/// Lamp shares that differ by more are the edge of a shadow, where each pixel is looked at.
+const SHADOW_EDGE: f32 = 0.15;
+/// Shares of the lamp and of the sky that differ by less, across a tile, are looked for at few of its points.
+const LEVEL: [f32; 2] = [0.12, 0.16];
+
+/// Points spread evenly over the unit disc: a sunflower's seeds, turned by `twist` of a full turn.
+fn seed_points<const N: usize>(twist: f64) -> [(f64, f64); N] {
+    const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
+    let (step_sin, step_cos) = GOLDEN_ANGLE.sin_cos();
+    let (mut sin, mut cos) = (twist * std::f64::consts::TAU).sin_cos();
+    std::array::from_fn(|index| {
+        let radius = ((index as f64 + 0.5) / N as f64).sqrt();
+        let point = (radius * cos, radius * sin);
+        (sin, cos) = (
+            sin * step_cos + cos * step_sin,
+            cos * step_cos - sin * step_sin,
+        );
+        point
+    })
+}
+
+fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
+    let helper = if normal.z.abs() < 0.9 {
+        Vector3::z()
+    } else {
+        Vector3::x()
+    };
+    let right = helper.cross(normal).normalize();
+    (right, normal.cross(&right))
+}
+
+/// Mean light of the points of the same face at most `reach` pixels away, the nearer ones counting more, if there are
+/// `enough` and they differ by less than `lamp_range` and `sky_range`.
+fn shared(
+    known: &[[Option<Lit>; TILE]; TILE],
+    face: (usize, usize),
+    (column, row): (usize, usize),
+    reach: usize,
+    enough: usize,
+    [lamp_range, sky_range]: [f32; 2],
+) -> Option<Lit> {
+    let (mut count, mut weight, mut sky, mut lamp) = (0, 0.0, 0.0, 0.0);
+    let (mut low, mut high) = ([1.0f32; 2], [0.0f32; 2]);
+    for there_row in row.saturating_sub(reach)..(row + reach + 1).min(TILE) {
+        for there_column in column.saturating_sub(reach)..(column + reach + 1).min(TILE) {
+            let Some(lit) = known[there_row][there_column].filter(|lit| lit.face == face) else {
+                continue;
+            };
+            let (across, down) = (there_column.abs_diff(column), there_row.abs_diff(row));
+            let near = 1.0 / (across * across + down * down) as f32;
+            count += 1;
+            weight += near;
+            sky += near * lit.sky;
+            lamp += near * lit.lamp;
+            low = [low[0].min(lit.lamp), low[1].min(lit.sky)];
+            high = [high[0].max(lit.lamp), high[1].max(lit.sky)];
+        }
+    }
+    (count >= enough && high[0] - low[0] < lamp_range && high[1] - low[1] < sky_range).then(|| {
+        Lit {
+            face,
+            sky: sky / weight,
+            lamp: lamp / weight,
+        }
+    })
+}
+
+/// May something in these bounds hide a part of a lamp of this radius, `length` away in `direction`? Never wrong if it
+/// says no.
+fn in_beam(
+    bounds: &Bounds,
+    point: &Point3<f64>,
+    direction: &Vector3<f64>,
+    length: f64,
+    radius: f64,
+) -> bool {
+    let center = bounds.center() - point;
+    let half = bounds.half();
+    let along = center.dot(direction);
+    let reach = half.dot(&direction.abs());
+    if along + reach <= 0.0 {
+        return false;
+    }
+    // The beam is no wider within the bounds than at their far end.
+    let margin = radius * ((along + reach) / length).min(1.0);
+    let grown = half.add_scalar(margin);
+    // Separating axes of the segment and the grown box: the three sides, then the three cross products.
+    let middle = center - direction * (length * 0.5);
+    let arm = direction * (length * 0.5);
+    let arm_size = arm.abs();
+    (0..3).all(|i| middle[i].abs() <= grown[i] + arm_size[i])
+        && (0..3).all(|i| {
+            let (j, k) = ((i + 1) % 3, (i + 2) % 3);
+            (middle[j] * arm[k] - middle[k] * arm[j]).abs()
+                <= grown[j] * arm_size[k] + grown[k] * arm_size[j] + 1e-12
+        })
+}
+
+impl Tracer<'_> {
+    /// Finds what may shade any of the points that a tile sees.
+    pub(super) fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
+        tile.reach = Bounds::of(
+            seen.iter()
+                .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
+        );
+        if tile.reach.min.x > tile.reach.max.x {
+            return;
+        }
+        // Room for the further samples of its pixels.
+        let spare = Vector3::from_element(2e-3);
+        tile.reach.min -= spare;
+        tile.reach.max += spare;
+        let center = tile.reach.center();
+        let half = tile.reach.half();
+        let lamp = &self.lighting.lamp;
+        let axis = lamp.center - center;
+        let length = axis.norm();
+        let direction = axis / length;
+        self.scene.casters(Light::Lamp, &mut tile.lamp, |bounds| {
+            let grown = Bounds {
+                min: bounds.min - half,
+                max: bounds.max + half,
+            };
+            in_beam(&grown, &center, &direction, length, lamp.radius)
+        });
+        self.scene.casters(Light::Sky, &mut tile.sky, |bounds| {
+            let apart = (bounds.center() - center).abs() - bounds.half() - half;
+            apart.max() < SKY_REACH
+        });
+    }
+
+    /// Finds the light on every point that a tile sees: exactly at every sixteenth pixel, at every fourth where those
+    /// of the tile differ, and between these where the edge of a shadow is.
+    pub(super) fn light(
+        &self,
+        tile: &Tile,
+        seen: &[(usize, Path, f64, Option<Hit>)],
+        lit: &mut [Lit],
+        width: usize,
+        scratch: &mut Scratch,
+    ) {
+        let Some(&(origin, ..)) = seen.first() else {
+            return;
+        };
+        let place = |at: usize| (at % width - origin % width, at / width - origin / width);
+        let mut known = [[None::<Lit>; TILE]; TILE];
+        for step in [4, 2, 1] {
+            // The coarsest lattice is centred in the tile.
+            let phase = step / 4 * 2;
+            let on_lattice = |i: usize| i % step == phase;
+            let before = known;
+            for &(at, ref path, _, hit) in seen {
+                let (column, row) = place(at);
+                let Some(hit) = hit else {
+                    continue;
+                };
+                if known[row][column].is_some() || !on_lattice(column) || !on_lattice(row) {
+                    continue;
+                }
+                let face = (hit.primitive, hit.crossing.part);
+                let shared = match step {
+                    4 => None,
+                    2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
+                    _ => shared(&before, face, (column, row), 1, 1, [SHADOW_EDGE, 1.0])
+                        .or_else(|| shared(&before, face, (column, row), 2, 3, LEVEL)),
+                };
+                let light =
+                    shared.unwrap_or_else(|| self.light_on(path, &hit, Some(tile), scratch));
+                known[row][column] = Some(light);
+                lit[at] = light;
+            }
+        }
+    }
+
+    pub(super) fn light_on(
+        &self,
+        path: &Path,
+        hit: &Hit,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> Lit {
+        let primitive = &self.scene.primitives()[hit.primitive];
+        if primitive.is_glass() {
+            return UNLIT;
+        }
+        if path.weight < WEAK {
+            return Lit {
+                face: (hit.primitive, hit.crossing.part),
+                sky: 0.85,
+                lamp: 0.8,
+            };
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let surface = primitive.shape.surface(&point, hit.crossing.part);
+        let facing = path.ray.direction.dot(&surface.normal) < 0.0;
+        let normal = if facing {
+            surface.normal
+        } else {
+            -surface.normal
+        };
+        let own = (!primitive.hollow).then_some(hit.primitive as u32);
+        // Seen in a mirror or through glass, fewer samples do.
+        let few = path.few || path.bounces > 0;
+        let sky = if few {
+            Self::sky_share::<FEW_SKY_SAMPLES>
+        } else {
+            Self::sky_share::<SKY_SAMPLES>
+        };
+        let lamp = if few {
+            Self::lamp_share::<FEW_LAMP_SAMPLES>
+        } else {
+            Self::lamp_share::<LAMP_SAMPLES>
+        };
+        Lit {
+            face: (hit.primitive, hit.crossing.part),
+            sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
+            lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
+                lamp(self, &point, own, path.twist, tile, scratch)
+            } else {
+                0.0
+            },
+        }
+    }
+
+    /// What may hide a light from a point: from the tile's choice if the point is among those it was made for.
+    fn casters_at(
+        &self,
+        light: Light,
+        point: &Point3<f64>,
+        tile: Option<&Tile>,
+        found: &mut Vec<u32>,
+        may_hide: impl Fn(&Bounds) -> bool,
+    ) {
+        match tile.filter(|tile| tile.reach.contains(point)) {
+            Some(tile) => {
+                let list = match light {
+                    Light::Lamp => &tile.lamp,
+                    Light::Sky => &tile.sky,
+                };
+                found.clear();
+                found.extend(
+                    list.iter()
+                        .filter(|&&index| may_hide(&self.scene.bounds()[index as usize])),
+                );
+            }
+            None => self.scene.casters(light, found, may_hide),
+        }
+    }
+
+    /// Share of the sky that near things leave to the point, 0..1.
+    fn sky_share<const SAMPLES: usize>(
+        &self,
+        point: &Point3<f64>,
+        normal: &Vector3<f64>,
+        own: Option<u32>,
+        twist: f64,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> f32 {
+        let center = point + normal * (SKY_REACH * 0.5);
+        self.casters_at(Light::Sky, point, tile, &mut scratch.casters, |bounds| {
+            let nearest = center.sup(&bounds.min).inf(&bounds.max);
+            (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
+                // Not wholly behind the surface.
+                && normal.dot(&(bounds.center() - point)) + normal.abs().dot(&bounds.half()) > 1e-3
+        });
+        scratch.casters.retain(|&index| Some(index) != own);
+        if scratch.casters.is_empty() {
+            return 1.0;
+        }
+        let (right, forward) = basis(normal);
+        let mut hidden = 0.0;
+        for (x, y) in seed_points::<SAMPLES>(twist) {
+            let direction =
+                right * x + forward * y + normal * (1.0 - x * x - y * y).max(0.0).sqrt();
+            let ray = Ray {
+                origin: *point,
+                direction,
+            };
+            let mut nearest = SKY_REACH;
+            for &caster in &scratch.casters {
+                let primitive = &self.scene.primitives()[caster as usize];
+                if let Some(crossing) = primitive.shape.crossing(&ray, LIFT, nearest) {
+                    nearest = crossing.t;
+                }
+            }
+            hidden += 1.0 - (nearest / SKY_REACH) as f32;
+        }
+        1.0 - 0.9 * hidden / SAMPLES as f32
+    }
+
+    /// Share of the lamp that the point sees, 0..1.
+    fn lamp_share<const SAMPLES: usize>(
+        &self,
+        point: &Point3<f64>,
+        own: Option<u32>,
+        twist: f64,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> f32 {
+        let lamp = &self.lighting.lamp;
+        let axis = lamp.center - point;
+        let length = axis.norm();
+        let direction = axis / length;
+        self.casters_at(Light::Lamp, point, tile, &mut scratch.casters, |bounds| {
+            in_beam(bounds, point, &direction, length, lamp.radius)
+        });
+        scratch.casters.retain(|&index| Some(index) != own);
+        if scratch.casters.is_empty() {
+            return 1.0;
+        }
+        let (right, forward) = basis(&direction);
+        let mut seen = 0.0;
+        for (x, y) in seed_points::<SAMPLES>(twist) {
+            let offset = axis + (right * x + forward * y) * lamp.radius;
+            let distance = offset.norm();
+            let ray = Ray {
+                origin: *point,
+                direction: offset / distance,
+            };
+            let mut share = 1.0;
+            for &caster in &scratch.casters {
+                let primitive = &self.scene.primitives()[caster as usize];
+                if primitive.shape.crossing(&ray, LIFT, distance).is_some() {
+                    share *= if primitive.is_glass() {
+                        GLASS_SHADOW
+                    } else {
+                        0.0
+                    };
+                    if share == 0.0 {
+                        break;
+                    }
+                }
+            }
+            seen += share;
+        }
+        seen / SAMPLES as f32
+    }
+}

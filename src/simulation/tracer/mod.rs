@@ -1,0 +1,324 @@
+//! A ray tracer for small scenes: one area lamp with soft shadows, sky light with ambient occlusion, mirrors, and glass
+//! that refracts by Snell's law and reflects by Fresnel's. No caustics: light that glass bends onto other things is
+//! left out, glass only dims it.
+//!
+//! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
+//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get two more for colour.
+
+mod light;
+mod shade;
+mod tiles;
+
+use nalgebra::{Point3, Vector3};
+use rayon::prelude::*;
+
+pub use self::shade::refracted;
+use self::{
+    light::{Lit, UNLIT},
+    shade::plus,
+    tiles::{Pyramid, TILE, Tile, overlap, window_of},
+};
+use super::{
+    scene::{ObjectId, Primitive, Scene},
+    shapes::{Bounds, Ray},
+    texture::{Rgb, scaled},
+};
+use crate::model::{camera::Intrinsics, pose::Pose};
+
+/// Metres by which a secondary ray leaves its surface.
+const LIFT: f64 = 1e-7;
+/// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
+const CONTRAST: f32 = 0.12;
+/// A round lamp below the ceiling.
+#[derive(Debug, Clone)]
+pub struct Lamp {
+    pub center: Point3<f64>,
+    pub radius: f64,
+    /// On a surface that faces it at `reference_m`.
+    pub irradiance: Rgb,
+    pub reference_m: f64,
+}
+
+/// What lights the room.
+#[derive(Debug, Clone)]
+pub struct Lighting {
+    pub lamp: Lamp,
+    /// Light from above and, weaker, from everywhere.
+    pub sky: Rgb,
+    pub ground: Rgb,
+    /// A window: direction towards it and irradiance, without shadows.
+    pub window: (Vector3<f64>, Rgb),
+}
+
+impl Default for Lighting {
+    fn default() -> Self {
+        Self {
+            lamp: Lamp {
+                center: Point3::new(0.75, -0.35, 2.55),
+                radius: 0.17,
+                irradiance: [0.78, 0.70, 0.58],
+                reference_m: 2.0,
+            },
+            sky: [0.34, 0.36, 0.40],
+            ground: [0.16, 0.14, 0.12],
+            window: (
+                Vector3::new(-0.75, -0.5, 0.45).normalize(),
+                [0.17, 0.20, 0.25],
+            ),
+        }
+    }
+}
+
+/// What one camera would record without noise; row by row.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rendering {
+    /// Linear, 1 is white paper in full light.
+    pub radiance: Vec<Rgb>,
+    /// Along the optical axis to the first surface, glass included; 0 = nothing there.
+    pub depth_m: Vec<f32>,
+    /// To the first surface that is not glass: what stereo and depth cameras tend to see.
+    pub depth_through_glass_m: Vec<f32>,
+    pub object: Vec<ObjectId>,
+}
+
+/// Renders a scene; rows in parallel on rayon's current pool.
+#[derive(Debug, Clone)]
+pub struct Tracer<'a> {
+    pub scene: &'a Scene,
+    pub lighting: &'a Lighting,
+}
+
+/// Reused per row.
+#[derive(Default)]
+struct Scratch {
+    casters: Vec<u32>,
+}
+
+/// A ray on its way.
+#[derive(Clone, Copy)]
+struct Path {
+    ray: Ray,
+    bounces: u32,
+    /// Metres so far.
+    travelled: f64,
+    /// Pixel width, radians.
+    spread: f64,
+    /// Turns the sample patterns, 0..1.
+    twist: f64,
+    /// One of several samples of its pixel.
+    few: bool,
+    /// Its part in the pixel, 0..1.
+    weight: f32,
+}
+
+/// Ray through image position `(u, v)` and the cosine that turns its length into depth.
+pub fn camera_ray(camera: &Intrinsics, world_from_camera: &Pose, u: f64, v: f64) -> (Ray, f64) {
+    let in_camera = camera.unproject(u, v, 1.0).coords;
+    let length = in_camera.norm();
+    let ray = Ray {
+        origin: Point3::from(world_from_camera.translation.vector),
+        direction: world_from_camera.rotation * (in_camera / length),
+    };
+    (ray, 1.0 / length)
+}
+
+/// A number in 0..1 that differs between neighbouring pixels like noise.
+fn twist_of(column: usize, row: usize) -> f64 {
+    // Jimenez's interleaved gradient noise.
+    (52.982_918_9 * (0.067_110_56 * column as f64 + 0.005_837_15 * row as f64).fract()).fract()
+}
+
+impl Tracer<'_> {
+    /// Renders what a camera sees.
+    pub fn render(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Rendering {
+        let width = camera.width;
+        let pixels = camera.pixels();
+        let prints = self.footprints(camera, world_from_camera);
+        let mut rendering = Rendering {
+            radiance: vec![[0.0; 3]; pixels],
+            depth_m: vec![0.0; pixels],
+            depth_through_glass_m: vec![0.0; pixels],
+            object: vec![ObjectId::ROOM; pixels],
+        };
+        let mut lit = vec![UNLIT; pixels];
+        let path = |u: f64, v: f64, twist: f64, few: bool| {
+            let (ray, cos) = camera_ray(camera, world_from_camera, u, v);
+            let path = Path {
+                ray,
+                bounces: 0,
+                travelled: 0.0,
+                spread: 1.0 / camera.fx,
+                twist,
+                few,
+                weight: 1.0,
+            };
+            (path, cos)
+        };
+        let bands: Vec<Vec<Tile>> = rendering
+            .radiance
+            .par_chunks_mut(width * TILE)
+            .zip(rendering.depth_m.par_chunks_mut(width * TILE))
+            .zip(rendering.depth_through_glass_m.par_chunks_mut(width * TILE))
+            .zip(rendering.object.par_chunks_mut(width * TILE))
+            .zip(lit.par_chunks_mut(width * TILE))
+            .enumerate()
+            .map_init(
+                Scratch::default,
+                |scratch, (band, ((((radiance, depth), through), object), lit))| {
+                    let top = band * TILE;
+                    let height = radiance.len() / width;
+                    let rows = top..top + height;
+                    let band: Vec<_> = prints
+                        .iter()
+                        .filter(|print| overlap(&print.window[1], &rows))
+                        .collect();
+                    let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
+                    for left in (0..width).step_by(TILE) {
+                        let right = (left + TILE).min(width);
+                        let frame = Pyramid::over(
+                            camera,
+                            world_from_camera,
+                            left..right,
+                            top..top + height,
+                        );
+                        let mut tile = Tile::over(&band, &(left..right), |print| {
+                            let primitive = print.primitive;
+                            frame.may_hold(&self.scene.bounds()[primitive]).then(|| {
+                                let shape = &self.scene.primitives()[primitive].shape;
+                                frame.nearest_m(shape).max(print.nearest_m)
+                            })
+                        });
+                        let mut seen = Vec::with_capacity(TILE * TILE);
+                        for row in 0..height {
+                            for column in left..right {
+                                let (u, v) = (column, top + row);
+                                let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
+                                let hit = self.first(&path.ray, &tile);
+                                seen.push((row * width + column, path, cos, hit));
+                            }
+                        }
+                        self.look_around(&mut tile, &seen);
+                        self.light(&tile, &seen, lit, width, scratch);
+                        for (at, path, cos, hit) in seen {
+                            radiance[at] =
+                                self.shade(&path, hit.as_ref(), Some(lit[at]), None, scratch);
+                            let Some(hit) = hit else {
+                                continue;
+                            };
+                            let primitive = &self.scene.primitives()[hit.primitive];
+                            depth[at] = (hit.crossing.t * cos) as f32;
+                            object[at] = primitive.object;
+                            through[at] = if primitive.is_glass() {
+                                self.scene
+                                    .nearest(&path.ray, hit.crossing.t, f64::INFINITY, |p| {
+                                        !p.is_glass()
+                                    })
+                                    .map_or(0.0, |hit| (hit.crossing.t * cos) as f32)
+                            } else {
+                                depth[at]
+                            };
+                        }
+                        tiles.push(tile);
+                    }
+                    tiles
+                },
+            )
+            .collect();
+        let first = rendering.radiance.clone();
+        rendering
+            .radiance
+            .par_chunks_mut(width)
+            .enumerate()
+            .for_each_init(Scratch::default, |scratch, (row, radiance)| {
+                for (column, radiance) in radiance.iter_mut().enumerate() {
+                    if !rough(camera, &rendering.object, &lit, &first, column, row) {
+                        continue;
+                    }
+                    let here = row * width + column;
+                    let around = [
+                        Some(here),
+                        (column > 0).then(|| here - 1),
+                        (column + 1 < width).then_some(here + 1),
+                        (row > 0).then(|| here.wrapping_sub(width)),
+                        (row + 1 < camera.height).then_some(here + width),
+                    ];
+                    let tile = &bands[row / TILE][column / TILE];
+                    let mut sum = scaled(*radiance, 1.0 / 3.0);
+                    for (index, (du, dv)) in [(-0.34, 0.17), (0.17, -0.34)].into_iter().enumerate()
+                    {
+                        let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
+                        let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
+                        let hit = self.first(&path.ray, tile);
+                        // What the pixel or one beside it shows of the same face: its texture and light are averaged
+                        // over a pixel already, and do not differ much. Glass is looked through again.
+                        let known = hit.and_then(|hit| {
+                            around.into_iter().flatten().find(|&there| {
+                                lit[there].face == (hit.primitive, hit.crossing.part)
+                            })
+                        });
+                        let colour = known.map_or_else(
+                            || self.shade(&path, hit.as_ref(), None, Some(tile), scratch),
+                            |there| first[there],
+                        );
+                        sum = plus(sum, scaled(colour, 1.0 / 3.0));
+                    }
+                    *radiance = sum;
+                }
+            });
+        rendering
+    }
+}
+
+/// Does a pixel differ from one of its neighbours in surface, or strongly in colour?
+fn rough(
+    camera: &Intrinsics,
+    object: &[ObjectId],
+    lit: &[Lit],
+    radiance: &[Rgb],
+    column: usize,
+    row: usize,
+) -> bool {
+    let width = camera.width;
+    let here = row * width + column;
+    let differs = |there: usize| {
+        let (a, b) = (radiance[here], radiance[there]);
+        if object[here] != object[there] {
+            return true;
+        }
+        // Textures are averaged over the pixel already; what is seen through glass is not.
+        if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
+            return false;
+        }
+        (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
+    };
+    (column > 0 && differs(here - 1))
+        || (column + 1 < width && differs(here + 1))
+        || (row > 0 && differs(here - width))
+        || (row + 1 < camera.height && differs(here + width))
+}
+
+/// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the
+/// silhouette of an object that stands, or would stand, in the scene.
+pub fn depth_alone(
+    primitives: &[Primitive],
+    camera: &Intrinsics,
+    world_from_camera: &Pose,
+) -> Vec<f32> {
+    let mut depth = vec![f32::INFINITY; camera.pixels()];
+    let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
+        bounds.joined(&primitive.shape.bounds())
+    });
+    let [columns, rows] = window_of(&bounds, camera, &world_from_camera.inverse());
+    for row in rows {
+        for column in columns.clone() {
+            let (ray, cos) = camera_ray(camera, world_from_camera, column as f64, row as f64);
+            depth[row * camera.width + column] = primitives
+                .iter()
+                .filter_map(|primitive| primitive.shape.crossing(&ray, LIFT, f64::INFINITY))
+                .map(|crossing| crossing.t)
+                .min_by(f64::total_cmp)
+                .map_or(f32::INFINITY, |t| (t * cos) as f32);
+        }
+    }
+    depth
+}

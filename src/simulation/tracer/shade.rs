@@ -1,0 +1,234 @@
+//! The colour that a ray brings back: what is matte, varnished, or glass, and what these mirror.
+
+use nalgebra::{Point3, Vector3};
+
+use super::{LIFT, Path, Scratch, Tracer, light::Lit, tiles::Tile};
+use crate::simulation::{
+    scene::{Finish, Hit, Primitive},
+    shapes::Ray,
+    texture::{Rgb, Spot, mixed, rgb, scaled},
+};
+
+const MAX_BOUNCES: u32 = 9;
+/// Mirrored light of a smaller part in the pixel is taken from the room at large.
+const FAINT: f32 = 0.045;
+
+/// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
+/// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
+pub fn refracted(
+    direction: &Vector3<f64>,
+    normal: &Vector3<f64>,
+    ratio: f64,
+) -> Option<Vector3<f64>> {
+    let cos = -direction.dot(normal);
+    let sin2_beyond = ratio * ratio * (1.0 - cos * cos);
+    (sin2_beyond <= 1.0)
+        .then(|| direction * ratio + normal * (ratio * cos - (1.0 - sin2_beyond).sqrt()))
+}
+
+/// Unpolarised share of light that a boundary reflects (Fresnel), from the cosines on both sides.
+fn fresnel(cos_here: f64, cos_beyond: f64, ratio: f64) -> f32 {
+    let parallel = (cos_here - ratio * cos_beyond) / (cos_here + ratio * cos_beyond);
+    let crossed = (ratio * cos_here - cos_beyond) / (ratio * cos_here + cos_beyond);
+    (0.5 * (parallel * parallel + crossed * crossed)) as f32
+}
+
+fn mirrored(direction: &Vector3<f64>, normal: &Vector3<f64>) -> Vector3<f64> {
+    direction - normal * (2.0 * direction.dot(normal))
+}
+
+pub(super) fn plus(a: Rgb, b: Rgb) -> Rgb {
+    std::array::from_fn(|i| a[i] + b[i])
+}
+
+fn times(a: Rgb, b: Rgb) -> Rgb {
+    std::array::from_fn(|i| a[i] * b[i])
+}
+
+impl Tracer<'_> {
+    fn trace(&self, path: &Path, scratch: &mut Scratch) -> Rgb {
+        let hit = self.scene.nearest(&path.ray, LIFT, f64::INFINITY, |_| true);
+        self.shade(path, hit.as_ref(), None, None, scratch)
+    }
+
+    pub(super) fn shade(
+        &self,
+        path: &Path,
+        hit: Option<&Hit>,
+        lit: Option<Lit>,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> Rgb {
+        let Some(hit) = hit else {
+            return self.surroundings(&path.ray.direction);
+        };
+        let primitive = &self.scene.primitives()[hit.primitive];
+        match primitive.material.finish {
+            Finish::Glass { index } => self.glass(path, hit, primitive, index, scratch),
+            finish => {
+                let lit = lit.unwrap_or_else(|| self.light_on(path, hit, tile, scratch));
+                self.opaque(path, hit, primitive, finish, lit, scratch)
+            }
+        }
+    }
+
+    /// What is beyond everything: the ceiling with the lamp, and the rest of the room behind the robot.
+    fn surroundings(&self, direction: &Vector3<f64>) -> Rgb {
+        let up = direction.z as f32;
+        let wall = mixed(rgb(0x8f8577), rgb(0xd8d2c4), (up * 2.0).clamp(0.0, 1.0));
+        scaled(wall, 0.55 + 0.25 * up.max(0.0))
+    }
+
+    /// The lamp and the window as bright patches in a mirror.
+    fn highlights(&self, from: &Point3<f64>, direction: &Vector3<f64>, softness: f64) -> Rgb {
+        let lamp = &self.lighting.lamp;
+        let to_lamp = lamp.center - from;
+        let distance = to_lamp.norm();
+        let patch = |cos: f64, radius: f64| {
+            // Squared chord instead of the angle.
+            let off = (2.0 * (1.0 - cos)).max(0.0).sqrt();
+            ((1.0 - (off - radius) / softness).clamp(0.0, 1.0)) as f32
+        };
+        let lamp_patch = patch(to_lamp.dot(direction) / distance, lamp.radius / distance);
+        let (towards, light) = &self.lighting.window;
+        let window_patch = patch(towards.dot(direction), 0.16);
+        plus(
+            scaled(lamp.irradiance, lamp_patch * 14.0),
+            scaled(*light, window_patch * 9.0),
+        )
+    }
+
+    fn glass(
+        &self,
+        path: &Path,
+        hit: &Hit,
+        primitive: &Primitive,
+        index: f64,
+        scratch: &mut Scratch,
+    ) -> Rgb {
+        let direction = path.ray.direction;
+        let point = path.ray.at(hit.crossing.t);
+        let outward = primitive.shape.surface(&point, hit.crossing.part).normal
+            * if primitive.hollow { -1.0 } else { 1.0 };
+        let entering = direction.dot(&outward) < 0.0;
+        let (normal, ratio) = if entering {
+            (outward, 1.0 / index)
+        } else {
+            (-outward, index)
+        };
+        if path.bounces >= MAX_BOUNCES {
+            return self.surroundings(&direction);
+        }
+        let onward = |direction: Vector3<f64>, share: f32| Path {
+            ray: Ray {
+                origin: point,
+                direction,
+            },
+            bounces: path.bounces + 1,
+            travelled: path.travelled + hit.crossing.t,
+            weight: path.weight * share,
+            ..*path
+        };
+        let reflection = mirrored(&direction, &normal);
+        let Some(transmission) = refracted(&direction, &normal, ratio) else {
+            return self.trace(&onward(reflection, 1.0), scratch);
+        };
+        let share = fresnel(-direction.dot(&normal), -transmission.dot(&normal), ratio);
+        let through = scaled(
+            self.trace(&onward(transmission, 1.0 - share), scratch),
+            0.985 * (1.0 - share),
+        );
+        // Reflections inside the wall are many and faint: followed only where they are the view itself.
+        if path.bounces > 1 || !entering {
+            return plus(through, scaled(self.surroundings(&reflection), share));
+        }
+        let reflected = plus(
+            self.trace(&onward(reflection, share), scratch),
+            self.highlights(&point, &reflection, 0.08),
+        );
+        plus(through, scaled(reflected, share))
+    }
+
+    fn opaque(
+        &self,
+        path: &Path,
+        hit: &Hit,
+        primitive: &Primitive,
+        finish: Finish,
+        lit: Lit,
+        scratch: &mut Scratch,
+    ) -> Rgb {
+        let direction = path.ray.direction;
+        let point = path.ray.at(hit.crossing.t);
+        let surface = primitive.shape.surface(&point, hit.crossing.part);
+        let cos = -direction.dot(&surface.normal);
+        let (normal, cos) = if cos < 0.0 {
+            (-surface.normal, -cos)
+        } else {
+            (surface.normal, cos)
+        };
+        let travelled = path.travelled + hit.crossing.t;
+        let colour = primitive.material.pattern.colour(&Spot {
+            u: surface.u,
+            v: surface.v,
+            part: surface.part,
+            point,
+            // Between the short and the long side of the pixel's oblique print.
+            footprint: travelled * path.spread / cos.max(0.1).sqrt(),
+        });
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        let sky = plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        );
+        let lamp = &lighting.lamp;
+        let to_lamp = lamp.center - point;
+        let distance = to_lamp.norm();
+        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
+        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
+        let light = plus(
+            scaled(sky, lit.sky),
+            scaled(lamp.irradiance, lit.lamp * falloff),
+        );
+        let diffuse = times(colour, light);
+        let Finish::Glossy {
+            reflectance,
+            sharpness,
+        } = finish
+        else {
+            return diffuse;
+        };
+        let share = reflectance
+            + (1.0 - reflectance) * (1.0 - cos as f32).powi(5) * (sharpness / 200.0).min(1.0);
+        let reflection = mirrored(&direction, &normal);
+        let seen = if path.bounces < 2 && path.weight * share > FAINT {
+            self.trace(
+                &Path {
+                    ray: Ray {
+                        origin: point + normal * LIFT,
+                        direction: reflection,
+                    },
+                    bounces: path.bounces + 2,
+                    travelled,
+                    spread: path.spread * 3.0,
+                    weight: path.weight * share,
+                    ..*path
+                },
+                scratch,
+            )
+        } else {
+            self.surroundings(&reflection)
+        };
+        let softness = 2.0 / f64::from(sharpness).sqrt();
+        let highlights = scaled(
+            self.highlights(&point, &reflection, softness),
+            (0.25 + 0.75 * lit.lamp) * (sharpness / 300.0).min(1.0),
+        );
+        plus(
+            scaled(diffuse, 1.0 - share),
+            scaled(plus(seen, highlights), share),
+        )
+    }
+}
