@@ -1,6 +1,6 @@
 //! `surprised query`: asks a service's memory.
 
-use std::path::PathBuf;
+use std::{path::PathBuf, str::FromStr};
 
 use anyhow::{Context, bail};
 use clap::{Subcommand, ValueEnum};
@@ -45,30 +45,37 @@ struct Prior {
     #[command(flatten)]
     place: Place,
     /// world_from_camera: x,y,z in metres and the quaternion qx,qy,qz,qw; camera axes x right, y down, z forward.
-    #[arg(
-        long,
-        value_name = "X,Y,Z,QX,QY,QZ,QW",
-        value_delimiter = ',',
-        num_args = 7,
-        allow_hyphen_values = true,
-        required = true
-    )]
-    pose: Vec<f64>,
+    #[arg(long, value_name = "X,Y,Z,QX,QY,QZ,QW", allow_hyphen_values = true)]
+    pose: Numbers<7>,
     /// Of the imagined camera, in pixels.
-    #[arg(
-        long,
-        value_name = "FX,FY,CX,CY,WIDTH,HEIGHT",
-        value_delimiter = ',',
-        num_args = 6,
-        required = true
-    )]
-    intrinsics: Vec<f64>,
+    #[arg(long, value_name = "FX,FY,CX,CY,WIDTH,HEIGHT")]
+    intrinsics: Numbers<6>,
     /// What to show.
     #[arg(long, value_enum, default_value_t = Plane::Expected)]
     plane: Plane,
     /// Where to write the PNG.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+}
+
+/// So many numbers with commas between them.
+#[derive(Debug, Clone, Copy)]
+struct Numbers<const N: usize>([f64; N]);
+
+impl<const N: usize> FromStr for Numbers<N> {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let numbers: Result<Vec<f64>, _> = text
+            .split(',')
+            .map(|number| number.trim().parse())
+            .collect();
+        numbers
+            .ok()
+            .and_then(|numbers| numbers.try_into().ok())
+            .map(Self)
+            .ok_or_else(|| format!("these must be {N} numbers with commas between them"))
+    }
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -131,7 +138,10 @@ impl Prior {
             "x", "y", "z", "qx", "qy", "qz", "qw", "fx", "fy", "cx", "cy", "width", "height",
         ];
         let mut parameters = format!("planes={plane}");
-        for (name, value) in names.iter().zip(self.pose.iter().chain(&self.intrinsics)) {
+        for (name, value) in names
+            .iter()
+            .zip(self.pose.0.iter().chain(&self.intrinsics.0))
+        {
             parameters += &format!(";{name}={value}");
         }
         let answer = self.place.ask("prior", &parameters).await?;

@@ -2,10 +2,11 @@
 
 import io
 import json
+import subprocess
 
 import numpy as np
 import scene
-from daemon import ask, prior_request, refusal, remembered
+from daemon import BINARY, DEADLINE_S, ask, prior_request, refusal, remembered
 from PIL import Image as Picture
 from surprised_proto import EvaluateReply, EvaluateRequest, PriorReply, ViewsReply
 
@@ -127,3 +128,23 @@ def test_status_answers(session, place, settled):
 
 def test_a_place_nobody_has_seen_is_unknown(session, daemon):
     assert "unknown_place" in refusal(session, "surprised/nowhere/@memory/views")
+
+
+def test_the_command_line_asks_for_a_picture_of_the_prior(daemon, place, settled, tmp_path):
+    path = tmp_path / "prior.png"
+    done = subprocess.run(
+        [BINARY, "query", "prior", "--place", place, "-e", daemon.endpoint, "--out", path]
+        + ["--pose", "0,0,0,0,0,0,1", "--intrinsics", "60,60,31.5,23.5,64,48"],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+    )
+    assert done.returncode == 0, done.stderr
+    assert path.read_bytes().startswith(b"\x89PNG")
+    wrong = subprocess.run(
+        [BINARY, "query", "prior", "--place", "p", "--out", path, "--pose", "0,0", "--intrinsics", "1,1,1,1,64,48"],
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE_S,
+    )
+    assert wrong.returncode == 2 and "7 numbers" in wrong.stderr
