@@ -79,6 +79,17 @@ NUMBERS = itertools.count(1)
 METRES = np.full((scene.HEIGHT, scene.WIDTH), 2.0, np.float32)
 
 # What is done to a good frame; the code and some words of the sentence that come back.
+def two_markers(message):
+    message.ClearField("world_from_camera")
+    message.calibration.camera_from_plate.position.SetInParent()
+    message.calibration.camera_from_plate.orientation.w = 1.0
+    for index, (x, y) in enumerate([(0, 0), (0.2, 0), (0.2, -0.1), (0, -0.1)]):
+        message.calibration.marker_in_plate.add(x=x, y=y)
+        marker = message.markers.markers.add(visible=index < 2)
+        marker.position.x, marker.position.y = x, y
+    message.markers.stamp.CopyFrom(message.stamp)
+
+
 BAD = {
     "unknown image encoding": (set_image(encoding="yuv422"), "image_encoding", "yuv422"),
     "bytes that are no jpeg": (set_image(encoding="jpeg", data=b"\xff\xd8 no more"), "image_data", "jpeg"),
@@ -121,6 +132,7 @@ BAD = {
     "no stamp": (clear("stamp"), "no_stamp", "capture time"),
     "no image": (clear("image"), "no_image", "image"),
     "no pose": (clear("world_from_camera"), "no_pose", "pose"),
+    "two markers of four": (two_markers, "too_few_markers", "marker"),
     "no depth": (clear("depth"), "no_depth", "depth"),
     "depth all zero": (set_depth(METRES * 0), "no_depth", "depth"),
     "depth all NaN": (set_depth(METRES * np.nan), "no_depth", "depth"),
