@@ -60,6 +60,9 @@ pub struct Script {
     furnishings: Vec<Item>,
 }
 
+/// A change of so many levels of 255 in a channel stands out of the sensor's noise, about one level.
+const TOUCHED_LEVELS: u8 = 4;
+
 /// Which of the three cameras are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Views {
@@ -367,6 +370,51 @@ impl Script {
             moment,
             pass: at.drive.pass(number),
         }
+    }
+
+    /// Where whatever comes and goes changes what the middle camera sees, be it its surface, shade, mirror image or
+    /// refraction, or a person: 255, else 0. Of all items in their places at once, so that it holds for those that are
+    /// yet to come or were taken away.
+    pub fn touched(&self, station: usize, capture: &Capture) -> Vec<u8> {
+        let intrinsics = &self.stations[station].rig.intrinsics;
+        let seen = |moment: &Moment| {
+            let scene = self.scene_of(moment);
+            let tracer = Tracer {
+                scene: &scene,
+                lighting: &self.lighting,
+            };
+            let rendering = tracer.render(intrinsics, &capture.world_from_camera);
+            // The same noise in both.
+            self.sensor.expose(
+                &rendering.radiance,
+                intrinsics.width,
+                1.0,
+                self.seed,
+                &[station as u64, capture.sequence],
+            )
+        };
+        let bare = Moment {
+            standing: Vec::new(),
+            carried: None,
+            person: None,
+            ..capture.moment.clone()
+        };
+        let crowded = Moment {
+            standing: (0..self.story.items.len()).collect(),
+            ..capture.moment.clone()
+        };
+        let (bare, crowded) = (seen(&bare), seen(&crowded));
+        bare.data
+            .chunks_exact(3)
+            .zip(crowded.data.chunks_exact(3))
+            .map(|(a, b)| {
+                let differs = a
+                    .iter()
+                    .zip(b)
+                    .any(|(a, b)| a.abs_diff(*b) >= TOUCHED_LEVELS);
+                if differs { 255 } else { 0 }
+            })
+            .collect()
     }
 
     /// Mean radiance while the shutter is open; `None` without motion blur.
