@@ -23,11 +23,13 @@ sys.path.insert(0, str(ROOT / "examples" / "python"))
 
 from surprised_proto import (  # noqa: E402
     EvaluateRequest,
+    ForgetRequest,
     Frame,
     Image,
     NextViewRequest,
     PriorRequest,
     Ring,
+    Sphere,
     SurpriseReport,
     encoding,
 )
@@ -122,6 +124,8 @@ def main(binary=ROOT / "target" / "release" / "surprised", seconds=8.0):
     evaluated = Frame()
     evaluated.CopyFrom(like)
     evaluated.stamp.GetCurrentTime()
+    nowhere = Sphere(radius=0.5)
+    nowhere.center.x = nowhere.center.y = nowhere.center.z = 1000.0
     questions = [
         ("prior: expected, coverage", "prior", prior),
         ("prior: every plane", "prior", every),
@@ -130,6 +134,7 @@ def main(binary=ROOT / "target" / "release" / "surprised", seconds=8.0):
         ("status", "status", None),
         ("next_view: ring of 8", "next_view", NextViewRequest(ring=Ring(robot="r1", camera="front", radius=0.3))),
         ("next_view: ring of 64", "next_view", NextViewRequest(ring=Ring(robot="r1", camera="front", count=64))),
+        ("forget: where nothing is", "forget", ForgetRequest(sphere=nowhere)),
     ]
     try:
         with zenoh.open(config) as session:
