@@ -89,6 +89,10 @@ fn likeness_is_that_of_the_frames_that_were_left_out() {
             assert!((likeness.psnr_db - psnr_db).abs() < 0.1, "{of:?}");
         }
         assert!(of.coverage > 0.95, "{of:?}");
+        assert!(
+            (of.gain - 1.1).abs() < 0.005 && of.with_gain.error_grey < 0.5,
+            "{of:?}"
+        );
     }
 }
 
@@ -96,7 +100,7 @@ fn likeness_is_that_of_the_frames_that_were_left_out() {
 fn what_is_expected_beside_a_surface_is_warped_into_place() {
     let wave = |_, x: f64, y: f64| (128.0 + 50.0 * (25.0 * x).sin() * (20.0 * y).cos()) as u8;
     let found = evaluated(0.03, wave);
-    let [prior, warped, copied] = found.predictions;
+    let [prior, refined, warped, copied] = found.predictions;
     assert_eq!(copied.coverage, 1.0);
     assert!(
         prior.coverage >= warped.coverage && warped.coverage > 0.9,
@@ -104,7 +108,7 @@ fn what_is_expected_beside_a_surface_is_warped_into_place() {
     );
     // Three pixels aside everything is elsewhere.
     assert!(copied.common.error_grey > 10.0, "{copied:?}");
-    for of in [prior, warped] {
+    for of in [prior, refined, warped] {
         assert!(of.common.error_grey < 2.0, "{of:?}");
         assert!(of.common.psnr_db > copied.common.psnr_db + 10.0, "{of:?}");
     }

@@ -29,6 +29,9 @@ pub fn run(
         "|Y| error",
         "| where all tell: PSNR dB",
         "|Y| error",
+        "| with one gain: PSNR dB",
+        "|Y| error",
+        "gain",
     ]);
     let mut results = Vec::new();
     for recording in recordings {
@@ -41,6 +44,9 @@ pub fn run(
                 number(of.own.error_grey, 2),
                 number(of.common.psnr_db, 2),
                 number(of.common.error_grey, 2),
+                number(of.with_gain.psnr_db, 2),
+                number(of.with_gain.error_grey, 2),
+                number(of.gain, 2),
             ]);
         }
         results.push((&recording.name, held_out));
