@@ -38,6 +38,9 @@ pub struct HeldOut {
     pub learnt: usize,
     pub left_out: usize,
     pub viewpoints: usize,
+    /// How far from the given pose refinement finds a frame, metres and radians.
+    pub correction_m: f64,
+    pub correction_rad: f64,
     /// The memory's prior at the given pose, and where the frame is found; the nearest learnt frame warped, and copied.
     pub predictions: [Prediction; PREDICTIONS],
 }
@@ -120,6 +123,7 @@ pub fn evaluate(
         name,
         ..Prediction::default()
     });
+    let (mut correction_m, mut correction_rad) = (0.0, 0.0);
     for &index in &left_out {
         let seen = recording.frame(index, &source)?;
         let distance_m = |other: &usize| {
@@ -133,10 +137,10 @@ pub fn evaluate(
         let nearest = recording.frame(*nearest, &source)?;
         let at = pipeline.prior(&seen.intrinsics, &seen.world_from_camera);
         let found = pipeline.evaluate(&seen);
-        let found = found
-            .map_err(|error| refused(index, error))?
-            .world_from_camera;
-        let at_refined = pipeline.prior(&seen.intrinsics, &found);
+        let found = found.map_err(|error| refused(index, error))?;
+        correction_m += found.pose_correction_m;
+        correction_rad += found.pose_correction_rad;
+        let at_refined = pipeline.prior(&seen.intrinsics, &found.world_from_camera);
         let predictions = [
             told(&at.prior),
             told(&at_refined.prior),
@@ -154,6 +158,8 @@ pub fn evaluate(
         learnt: learnt.len(),
         left_out: left_out.len(),
         viewpoints: pipeline.memory().viewpoints().len(),
+        correction_m: correction_m / frames,
+        correction_rad: correction_rad / frames,
         predictions: sums.map(|sum| Prediction {
             coverage: sum.coverage / frames,
             own: mean(sum.own),

@@ -61,8 +61,12 @@ pub fn run(
     }
     for (name, held_out) in &results {
         println!(
-            "{name}: {} frames learnt into {} viewpoints, {} left out",
-            held_out.learnt, held_out.viewpoints, held_out.left_out
+            "{name}: {} frames learnt into {} viewpoints, {} left out; found {:.1} mm and {:.2} degrees from their poses",
+            held_out.learnt,
+            held_out.viewpoints,
+            held_out.left_out,
+            1000.0 * held_out.correction_m,
+            held_out.correction_rad.to_degrees()
         );
     }
     print!("{table}");
