@@ -19,6 +19,7 @@ use surprised::{
         cpu::{CpuEngine, Observation, RecallView, Score},
         gpu::GpuEngine,
     },
+    memory::forget::{Forget, Forgetting, Region},
     model::{belief::Record, frame::RgbImage, report::Report, viewpoint::Viewpoint},
     pipeline::Pipeline,
     stages::{
@@ -502,6 +503,40 @@ fn a_lost_device_loses_no_frame_that_was_reported() {
     );
     assert_eq!(on_gpu(disturbed.pipeline.engine()).counters().losses, 3);
     assert_eq!(on_gpu(undisturbed.pipeline.engine()).counters().losses, 0);
+}
+
+#[test]
+fn what_is_forgotten_is_forgotten_on_the_card_too() {
+    let settings = Settings::robust();
+    let Some(engine) = gpu(&settings) else { return };
+    let mut robot = Robot::new(engine);
+    for step in 0..5 {
+        robot.see(&place(false), step);
+    }
+    let (lens, here) = (camera(165, 123), pose([0.05, 0.0, 0.0], [0.0; 3]));
+    let seen = |pipeline: &mut Pipeline| {
+        let prior = pipeline.prior(&lens, &here).prior;
+        prior
+            .plane(prior::COVERAGE)
+            .filter(|&count| count > 0.0)
+            .count()
+    };
+    let before = seen(&mut robot.pipeline);
+    let mut forgetting = Forgetting::new(Forget {
+        region: Some(Region::Sphere {
+            center: Point3::new(0.05, 0.05, 2.0),
+            radius_m: 0.3,
+        }),
+        span_ns: None,
+    });
+    assert!(robot.pipeline.forget(&mut forgetting, 100));
+    let after = seen(&mut robot.pipeline);
+    // The region's outline, 25 pixels in radius, less what the sphere's edge cuts.
+    assert!(
+        after + 1900 < before,
+        "{after} of {before} pixels are still seen"
+    );
+    assert_eq!(on_gpu(robot.pipeline.engine()).counters().on_processor, 0);
 }
 
 #[test]

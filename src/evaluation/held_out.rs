@@ -1,9 +1,10 @@
 //! How well a memory tells what is seen from where nobody stood: frames of a recording are left out, the rest is learnt,
 //! and what is expected at the poses of the left out is compared with them.
 //!
-//! Beside it, what the nearest learnt frame alone tells: copied as it is, and warped, that is its surface projected into
-//! the other pose with its colours. Pictures are compared as they came, without refinement of the pose or gain, in grey
-//! levels.
+//! Beside it, what the memory tells where the left out frame itself is found by refinement, and what the nearest learnt
+//! frame alone tells: copied as it is, and warped, that is its surface projected into the other pose with its colours.
+//! Pictures are compared in grey levels, as they came, and with one gain a frame that is fitted to the left out frame: a
+//! memory that looks past exposures has the exposure of its first frames.
 
 use std::sync::Arc;
 
@@ -29,14 +30,19 @@ use crate::{
 /// How often one is left out.
 pub const EVERY: usize = 5;
 
+const PREDICTIONS: usize = 4;
+
 /// Means over the frames that were left out.
 #[derive(Debug, Clone, Serialize)]
 pub struct HeldOut {
     pub learnt: usize,
     pub left_out: usize,
     pub viewpoints: usize,
-    /// The memory's prior; the nearest learnt frame warped; the same copied.
-    pub predictions: [Prediction; 3],
+    /// How far from the given pose refinement finds a frame, metres and radians.
+    pub correction_m: f64,
+    pub correction_rad: f64,
+    /// The memory's prior at the given pose, and where the frame is found; the nearest learnt frame warped, and copied.
+    pub predictions: [Prediction; PREDICTIONS],
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -48,6 +54,10 @@ pub struct Prediction {
     pub own: Likeness,
     /// Over the pixels that all predictions tell.
     pub common: Likeness,
+    /// The same with one gain a frame.
+    pub with_gain: Likeness,
+    /// What the left out frames are brighter than predicted, a factor.
+    pub gain: f64,
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
@@ -103,10 +113,17 @@ pub fn evaluate(
             .map_err(|error| refused(index, error))?;
     }
     let engine = CpuEngine::new(settings, pool.clone(), Isa::detect());
-    let mut sums = ["prior", "nearest warped", "nearest copied"].map(|name| Prediction {
+    let names = [
+        "prior",
+        "prior, pose refined",
+        "nearest warped",
+        "nearest copied",
+    ];
+    let mut sums = names.map(|name| Prediction {
         name,
         ..Prediction::default()
     });
+    let (mut correction_m, mut correction_rad) = (0.0, 0.0);
     for &index in &left_out {
         let seen = recording.frame(index, &source)?;
         let distance_m = |other: &usize| {
@@ -119,8 +136,14 @@ pub fn evaluate(
             .expect("four of five frames are learnt");
         let nearest = recording.frame(*nearest, &source)?;
         let at = pipeline.prior(&seen.intrinsics, &seen.world_from_camera);
+        let found = pipeline.evaluate(&seen);
+        let found = found.map_err(|error| refused(index, error))?;
+        correction_m += found.pose_correction_m;
+        correction_rad += found.pose_correction_rad;
+        let at_refined = pipeline.prior(&seen.intrinsics, &found.world_from_camera);
         let predictions = [
             told(&at.prior),
+            told(&at_refined.prior),
             warped(&nearest, &seen, settings, &engine),
             colours(&nearest).into_iter().map(Some).collect(),
         ];
@@ -135,10 +158,14 @@ pub fn evaluate(
         learnt: learnt.len(),
         left_out: left_out.len(),
         viewpoints: pipeline.memory().viewpoints().len(),
+        correction_m: correction_m / frames,
+        correction_rad: correction_rad / frames,
         predictions: sums.map(|sum| Prediction {
             coverage: sum.coverage / frames,
             own: mean(sum.own),
             common: mean(sum.common),
+            with_gain: mean(sum.with_gain),
+            gain: sum.gain / frames,
             ..sum
         }),
     })
@@ -199,7 +226,7 @@ fn warped(nearest: &Frame, seen: &Frame, settings: &Settings, engine: &CpuEngine
     told(&prior)
 }
 
-fn add(sums: &mut [Prediction; 3], predictions: &[Predicted; 3], seen: &Frame) {
+fn add(sums: &mut [Prediction; PREDICTIONS], predictions: &[Predicted; PREDICTIONS], seen: &Frame) {
     let observed = colours(seen);
     let common: Vec<bool> = (0..observed.len())
         .map(|pixel| predictions.iter().all(|told| told[pixel].is_some()))
@@ -207,12 +234,38 @@ fn add(sums: &mut [Prediction; 3], predictions: &[Predicted; 3], seen: &Frame) {
     for (sum, told) in sums.iter_mut().zip(predictions) {
         let covered = told.iter().flatten().count();
         sum.coverage += covered as f64 / told.len().max(1) as f64;
-        let own = likeness(told, seen, &observed, |_| true);
-        let common = likeness(told, seen, &observed, |pixel| common[pixel]);
-        for (sum, of_frame) in [(&mut sum.own, own), (&mut sum.common, common)] {
+        let gain = gain(told, &observed);
+        sum.gain += f64::from(gain);
+        let of_frame = [
+            (&mut sum.own, likeness(told, seen, &observed, 1.0, |_| true)),
+            (
+                &mut sum.common,
+                likeness(told, seen, &observed, 1.0, |pixel| common[pixel]),
+            ),
+            (
+                &mut sum.with_gain,
+                likeness(told, seen, &observed, gain, |pixel| common[pixel]),
+            ),
+        ];
+        for (sum, of_frame) in of_frame {
             sum.psnr_db += of_frame.psnr_db;
             sum.error_grey += of_frame.error_grey;
         }
+    }
+}
+
+/// The median of Y over the predicted Y, where neither is dark or saturated.
+fn gain(told: &Predicted, observed: &[[f32; CHANNELS]]) -> f32 {
+    let pairs = told.iter().zip(observed);
+    let mut ratios: Vec<f32> = pairs
+        .filter_map(|(told, observed)| Some((told.as_ref()?[0], observed[0])))
+        .filter(|(told, observed)| *told > 20.0 && (10.0..245.0).contains(observed))
+        .map(|(told, observed)| observed / told)
+        .collect();
+    let middle = ratios.len() / 2;
+    match ratios.get(middle) {
+        Some(_) => *ratios.select_nth_unstable_by(middle, f32::total_cmp).1,
+        None => 1.0,
     }
 }
 
@@ -221,6 +274,7 @@ fn likeness(
     told: &Predicted,
     seen: &Frame,
     observed: &[[f32; CHANNELS]],
+    gain: f32,
     wanted: impl Fn(usize) -> bool,
 ) -> Likeness {
     let (mut squares, mut errors, mut count) = (0.0f64, 0.0f64, 0usize);
@@ -229,6 +283,7 @@ fn likeness(
         let Some(predicted) = predicted.filter(|_| wanted(pixel)) else {
             continue;
         };
+        let predicted = predicted.map(|value| gain * value);
         count += 1;
         errors += f64::from((predicted[0] - observed[pixel][0]).abs());
         let drawn = rgb_from_ycbcr(predicted);

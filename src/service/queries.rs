@@ -111,40 +111,51 @@ struct Payload(Vec<u8>, Encoding);
 /// A query may name one place or, by wildcards, many; and one question or many.
 async fn answer(questions: &Questions, query: &Query) {
     let key = query.key_expr();
+    if key.is_wild() {
+        answer_all(questions, query).await;
+        return;
+    }
+    let root = &questions.places.root;
+    let camera = CameraPath::parse(root, key.as_str());
+    let replied = match camera.filter(|path| path.key(root, keys::MODE) == key.as_str()) {
+        Some(camera) => mode_of(questions, &camera, query).await,
+        None => answer_one(questions, query).await,
+    };
+    reply(query, key.as_str(), replied).await;
+}
+
+async fn answer_one(questions: &Questions, query: &Query) -> Result<Held<Payload>, Refusal> {
+    let key = query.key_expr().as_str();
+    let unknown = || {
+        Refusal::new(
+            "unknown_place",
+            format!(
+                "{key} is unknown: a place begins with its first frame, and is asked for {}",
+                QUESTIONS.join(", ")
+            ),
+        )
+    };
+    let (name, question) = keys::parse_memory(&questions.places.root, key).ok_or_else(unknown)?;
+    if question == keys::MODE {
+        // A place may be told before anything has come.
+        return mode_of_place(questions, name, query).await;
+    }
+    let place = questions.places.get(name);
+    let place = place.filter(|_| QUESTIONS.contains(&question));
+    let place = place.ok_or_else(unknown)?;
+    reply_to(question, name, &place, query, questions).await
+}
+
+/// Whoever is there answers; nobody else is missed.
+async fn answer_all(questions: &Questions, query: &Query) {
     let asked =
         |key: &str| KeyExpr::try_from(key).is_ok_and(|one| query.key_expr().intersects(&one));
     let root = &questions.places.root;
-    let mut matched = false;
-    // By its name a camera, or a place, may be told its mode before anything has come from it.
-    let camera = CameraPath::parse(root, key.as_str())
-        .filter(|path| !key.is_wild() && path.key(root, keys::MODE) == key.as_str());
-    if let Some(camera) = camera {
-        reply(
-            query,
-            key.as_str(),
-            mode_of(questions, &camera, query).await,
-        )
-        .await;
-        return;
-    }
-    if let Some((place, keys::MODE)) = keys::parse_memory(root, key.as_str()) {
-        reply(
-            query,
-            key.as_str(),
-            mode_of_place(questions, place, query).await,
-        )
-        .await;
-        return;
-    }
     for (name, place) in questions.places.all() {
-        for question in QUESTIONS {
+        // What cannot be undone is asked of one place by its name.
+        for question in QUESTIONS.into_iter().filter(|&question| question != FORGET) {
             let key = keys::memory(root, &name, question);
-            // What cannot be undone is asked of one place by its name.
-            if question == FORGET && query.key_expr().is_wild() {
-                continue;
-            }
             if asked(&key) {
-                matched = true;
                 let replied = reply_to(question, &name, &place, query, questions).await;
                 reply(query, &key, replied).await;
             }
@@ -156,21 +167,9 @@ async fn answer(questions: &Questions, query: &Query) {
             };
             let key = camera.key(root, keys::MODE);
             if asked(&key) {
-                matched = true;
                 reply(query, &key, mode_of(questions, &camera, query).await).await;
             }
         }
-    }
-    // Wildcards ask whoever is there; one name asks for that place.
-    if !matched && !key.is_wild() {
-        let refusal = Refusal::new(
-            "unknown_place",
-            format!(
-                "{key} is unknown: a place begins with its first frame, and is asked for {}",
-                QUESTIONS.join(", ")
-            ),
-        );
-        reply_refusal(query, &refusal).await;
     }
 }
 
@@ -233,14 +232,15 @@ async fn reply_to(
             payload(&reply, parameters, room)
         }
         "evaluate" => {
-            let (request, room) = request(query, questions)?;
+            let (request, _room) = request(query, questions)?;
             if request == proto::EvaluateRequest::default() {
                 return Err(bad(
                     "the request has no payload: send an EvaluateRequest with a frame",
                 ));
             }
             let camera = camera_parameters(parameters)?;
-            let reply = questions.evaluate(name, place, request, camera).await?;
+            let evaluated = questions.evaluate(name, place, request, camera);
+            let Held { reply, room } = evaluated.await?;
             payload(&reply, parameters, room)
         }
         "views" => {

@@ -169,7 +169,7 @@ impl Questions {
         place: &Place,
         request: proto::EvaluateRequest,
         camera: Option<Source>,
-    ) -> Result<proto::EvaluateReply, Refusal> {
+    ) -> Result<Held<proto::EvaluateReply>, Refusal> {
         let frame = request
             .frame
             .ok_or_else(|| Refusal::new("no_image", "the request has no frame: fill `frame`"))?;
@@ -180,12 +180,16 @@ impl Questions {
                 answer,
             })
             .await?;
+        let room = self.room(size_of_val(evaluated.surprise.as_slice()))?;
         let report = encode::report(&evaluated.report, name, evaluated.processing_seconds);
         let (width, height) = (evaluated.report.width, evaluated.report.height);
         let map = encode::plane(width, height, evaluated.surprise.into_iter());
-        Ok(proto::EvaluateReply {
-            report: Some(report),
-            map: Some(map),
+        Ok(Held {
+            reply: proto::EvaluateReply {
+                report: Some(report),
+                map: Some(map),
+            },
+            room: Some(room),
         })
     }
 

@@ -8,7 +8,7 @@ use surprised::{
 
 use crate::{
     rig::{CAMERA, ROOT, Rig, camera, next_report, posed},
-    web::send_json,
+    web::{send, send_json},
 };
 
 #[tokio::test(flavor = "multi_thread")]
@@ -48,8 +48,11 @@ async fn the_unknown_ranks_before_the_known() {
     assert!(known.covered > 0.9 && known.uncertainty > 0.0, "{known:?}");
     assert_eq!(half.world_from_camera, Some(encode::pose(&candidates[2])));
     let path = "POST /api/v1/places/lab/next_view";
-    let page = send_json(&rig, path, encode::json(&request)).await;
-    assert_eq!(page.json(), encode::json(&reply));
+    // As JSON in and as it is out, to the last bit.
+    let head = ["Accept: application/protobuf"];
+    let body = encode::json(&request).to_string();
+    let page = send(&rig, path, &head, body.as_bytes()).await;
+    assert_eq!(page.body, encode::bytes(&reply));
 
     // On the spot: it knows what is ahead of it, and nothing behind.
     let selector = format!("{key}?robot=anna;camera=head;count=4");

@@ -29,6 +29,9 @@ pub fn run(
         "|Y| error",
         "| where all tell: PSNR dB",
         "|Y| error",
+        "| with one gain: PSNR dB",
+        "|Y| error",
+        "gain",
     ]);
     let mut results = Vec::new();
     for recording in recordings {
@@ -41,6 +44,9 @@ pub fn run(
                 number(of.own.error_grey, 2),
                 number(of.common.psnr_db, 2),
                 number(of.common.error_grey, 2),
+                number(of.with_gain.psnr_db, 2),
+                number(of.with_gain.error_grey, 2),
+                number(of.gain, 2),
             ]);
         }
         results.push((&recording.name, held_out));
@@ -55,8 +61,12 @@ pub fn run(
     }
     for (name, held_out) in &results {
         println!(
-            "{name}: {} frames learnt into {} viewpoints, {} left out",
-            held_out.learnt, held_out.viewpoints, held_out.left_out
+            "{name}: {} frames learnt into {} viewpoints, {} left out; found {:.1} mm and {:.2} degrees from their poses",
+            held_out.learnt,
+            held_out.viewpoints,
+            held_out.left_out,
+            1000.0 * held_out.correction_m,
+            held_out.correction_rad.to_degrees()
         );
     }
     print!("{table}");

@@ -200,8 +200,9 @@ async fn evaluate(
     let body = to_bytes(body, length).await.map_err(|_| too_large())?;
     let request = message(&head.headers, &body)?;
     drop(body);
-    let answer = questions.evaluate(&name, &place, request, camera).await?;
-    Ok(reply(&head.headers, &answer, Some(room)))
+    let evaluated = questions.evaluate(&name, &place, request, camera).await?;
+    drop(room);
+    Ok(reply(&head.headers, &evaluated.reply, evaluated.room))
 }
 
 async fn next_view(
