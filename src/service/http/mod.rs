@@ -1,6 +1,7 @@
 //! The service for people and monitors, over HTTP.
 //!
 //! ```text
+//! GET /                                             the page for people
 //! GET /healthz                                      the process answers
 //! GET /readyz                                       everything is up
 //! GET /api/v1/info                                  version, endpoints, settings
@@ -15,6 +16,8 @@
 //! `application/problem+json`.
 
 mod limits;
+
+mod page;
 
 mod problem;
 
@@ -115,6 +118,7 @@ pub fn start(listener: TcpListener, readiness: Readiness, parts: Parts) -> std::
 fn router(app: App) -> Router {
     let camera = "/api/v1/places/{place}/robots/{robot}/{camera}";
     Router::new()
+        .merge(page::routes())
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(readyz))
         .route("/api/v1/info", get(info))
