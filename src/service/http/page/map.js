@@ -263,14 +263,15 @@ async function ask() {
   try {
     const response = await request(`${placePath(place.name)}/prior`, {
       method: "POST",
-      accept: "image/png",
       json: {
         world_from_camera: { position: { x, y, z }, orientation: { x: qx, y: qy, z: qz, w: qw } },
         intrinsics: { ...lens.image, ...lens.intrinsics },
+        planes: ["expected"],
       },
     });
-    const covered = Number(response.headers.get("surprised-covered"));
-    const bitmap = await createImageBitmap(await response.blob());
+    const { expected, covered } = await response.json();
+    const file = Uint8Array.from(atob(expected.data), (letter) => letter.charCodeAt(0));
+    const bitmap = await createImageBitmap(new Blob([file], { type: "image/png" }));
     const picture = byId("prior-picture");
     picture.width = bitmap.width;
     picture.height = bitmap.height;

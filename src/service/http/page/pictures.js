@@ -162,7 +162,7 @@ export class Picture {
           rx: 2,
         };
         // A dark line below the bright one: it is seen on anything.
-        return [svg("rect", { ...place, class: "box-under" }), svg("rect", { ...place, class: "box", "data-region": box.id })];
+        return [svg("rect", { ...place, class: "box-under" }), svg("rect", { ...place, class: "box", "data-event": box.event_id })];
       }),
     );
   }

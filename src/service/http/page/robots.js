@@ -18,6 +18,7 @@ export function stateWords(camera) {
     stalled: ago === null ? "there, but no frame yet" : `no frame for ${ago}`,
     refused: "its frames are refused",
     gone: ago === null ? "gone" : `gone for ${ago}`,
+    unknown: "not known",
   };
   return { state, words: words[state] };
 }
@@ -60,6 +61,8 @@ function make() {
 function update(card, place, camera) {
   const { parts } = card;
   set(card, "data-tone", toneOf(place, cameraKey(camera)));
+  set(card, "data-camera", cameraKey(camera));
+  set(card, "data-sequence", camera.last_sequence);
   set(parts.link, "href", cameraAddress(place.name, camera));
   say(parts.robot, camera.robot);
   say(parts.camera, camera.camera);
@@ -96,6 +99,6 @@ export function drawRobots(place) {
   const live = cameras.filter((camera) => stateOf(camera) === "live").length;
   const words = [count(robots, "robot")];
   if (cameras.length !== robots) words.push(count(cameras.length, "camera"));
-  words.push(live === cameras.length ? "all live" : `${live} of ${cameras.length} live`);
+  if (cameras.every((camera) => stateOf(camera) !== "unknown")) words.push(live === cameras.length ? "all live" : `${live} of ${cameras.length} live`);
   say(byId("cameras-count"), words.join(" · "));
 }

@@ -16,10 +16,9 @@ const POLL_EVERY_MS = 2_000;
 const SILENCE_MS = 6_000;
 const RETRY_MS = [1_000, 2_000, 3_000, 5_000];
 
-export async function request(path, { method = "GET", json, accept, within = ANSWER_WITHIN_MS } = {}) {
+export async function request(path, { method = "GET", json, within = ANSWER_WITHIN_MS } = {}) {
   const headers = {};
   if (json !== undefined) headers["Content-Type"] = "application/json";
-  if (accept) headers.Accept = accept;
   let response;
   try {
     response = await fetch(path, {

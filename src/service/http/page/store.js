@@ -184,8 +184,9 @@ export function placeNow(place) {
   return latest ?? now();
 }
 
-/** `live`, `stalled` (there, but no frames), `refused` (frames, but none is taken) or `gone`. */
+/** `live`, `stalled` (there, but no frames), `refused` (frames, but none is taken), `gone`, or `unknown`. */
 export function stateOf(camera) {
+  if (store.link === "gone") return "unknown";
   const frame_ms = lastFrame(camera);
   const quiet = frame_ms === null || now() - frame_ms > STALLED_MS;
   if (!camera.live) return quiet ? "gone" : "live";

@@ -3,7 +3,7 @@
 import { byId, el, facts, keyed, say, set, show } from "./dom.js";
 import { Thumbnails } from "./pictures.js";
 import { cameraAddress, stateWords } from "./robots.js";
-import { endedEvents, openEvents, placeNow, stateOf } from "./store.js";
+import { endedEvents, openEvents, placeNow, stateOf, store } from "./store.js";
 import { at, clock, list, nats, span } from "./words.js";
 
 /** Coverage below which a camera is still getting to know its place. */
@@ -27,7 +27,7 @@ function judge(place) {
   const cameras = [...place.cameras.values()];
   const open = openEvents(place);
   const live = cameras.filter((camera) => stateOf(camera) === "live");
-  const trouble = troubles(cameras);
+  const trouble = store.link === "gone" ? [] : troubles(cameras);
   if (open.length) {
     const event = open[0];
     const who = list(event.robots);
@@ -40,6 +40,9 @@ function judge(place) {
       since: `since ${since(place, event)} ago${others ? `, and ${others} more below` : ""}`,
       trouble,
     };
+  }
+  if (store.link === "gone") {
+    return { tone: "trouble", title: "Nothing unexpected when last heard of", since: "What has happened since then is not known.", trouble: [] };
   }
   if (!live.length) {
     const calm = { tone: "trouble", title: "Nobody is watching", trouble };
