@@ -3,7 +3,8 @@
 //! ```text
 //! <root>/<place>/<robot>/<camera>/{calibration|frame|pose|markers|truth} from robots
 //! <root>/<place>/<robot>/<camera>/surprise/{report|map|...|rejected} from the service
-//! <root>/<place>/@memory/{prior|evaluate|views|status}               queryables
+//! <root>/<place>/<robot>/<camera>/mode                               put and queryable
+//! <root>/<place>/@memory/{prior|evaluate|views|status|...}           queryables
 //! <root>/<place>/@live/robot/<robot>/<camera>                        liveliness of cameras
 //! <root>/<place>/@live/service/<session>                             liveliness of services
 //! ```
@@ -21,6 +22,8 @@ pub const FRAME: &str = "frame";
 pub const CALIBRATION: &str = "calibration";
 pub const POSE: &str = "pose";
 pub const MARKERS: &str = "markers";
+/// What a camera's frames do to the memory.
+pub const MODE: &str = "mode";
 /// What really is there, as JSON; from simulated robots only.
 pub const TRUTH: &str = "truth";
 pub const REPORT: &str = "surprise/report";
