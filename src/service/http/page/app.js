@@ -62,12 +62,25 @@ function draw() {
 
 function drawTitle(place) {
   const open = place ? known.openEvents(place).length : 0;
-  const title = store.link === "gone" ? "gone – surprised" : open ? `(${open}) ${place.name} – surprised` : place ? `${place.name} – surprised` : "surprised";
+  const title =
+    store.link === "gone"
+      ? "gone – surprised"
+      : open
+        ? `(${open}) ${place.name} – surprised`
+        : place
+          ? `${place.name} – surprised`
+          : "surprised";
   if (document.title !== title) document.title = title;
   say(byId("title"), place ? `Surprise in ${place.name}` : "Surprise");
 }
 
-const LINK_WORDS = { connecting: "connecting", live: "live", polling: "live, asking", locked: "locked", gone: "no answer" };
+const LINK_WORDS = {
+  connecting: "connecting",
+  live: "live",
+  polling: "live, asking",
+  locked: "locked",
+  gone: "no answer",
+};
 
 function drawLink() {
   const link = byId("link");
@@ -119,10 +132,10 @@ function drawEmpty() {
   say(byId("empty-endpoint"), endpoint ?? "the service's router");
 }
 
-function drawAbout(place) {
-  const parts = [`surprised ${store.version ?? ""}`, count(place.viewpoints ?? 0, "viewpoint")];
-  if (place.memory_bytes !== undefined) parts.push(`${bytes(place.memory_bytes)} of ${bytes(place.memory_bytes_max)} memory`);
-  if (place.engine) parts.push(`on the ${place.engine}`);
+function drawAbout({ status }) {
+  const parts = [`surprised ${store.version ?? ""}`, count(status.viewpoints ?? 0, "viewpoint")];
+  if (status.memory_bytes_max) parts.push(`${bytes(status.memory_bytes)} of ${bytes(status.memory_bytes_max)} memory`);
+  if (status.engine) parts.push(`on the ${status.engine}`);
   say(byId("about"), parts.join(" · "));
 }
 
@@ -140,15 +153,21 @@ function announce(text) {
 const failed = (trouble) => console.warn(trouble.message);
 
 function fetchEvents(place) {
-  return get(`${placePath(place)}/events`).then((reply) => known.takeEvents(place, reply), failed).then(redrawAll);
+  return get(`${placePath(place)}/events`)
+    .then((reply) => known.takeEvents(place, reply), failed)
+    .then(redrawAll);
 }
 
 function fetchTimeline(place) {
-  return get(`${placePath(place)}/timeline`).then(known.takeTimeline, failed).then(redrawAll);
+  return get(`${placePath(place)}/timeline`)
+    .then(known.takeTimeline, failed)
+    .then(redrawAll);
 }
 
 function fetchViews(place) {
-  return get(`${placePath(place)}/views`).then((reply) => known.takeViews(place, reply), failed).then(redrawAll);
+  return get(`${placePath(place)}/views`)
+    .then((reply) => known.takeViews(place, reply), failed)
+    .then(redrawAll);
 }
 
 /** What the stream does not repeat. */
@@ -172,7 +191,9 @@ const on = {
     const { updated } = known.hello(message);
     // Another version has another page.
     if (updated) location.reload();
-    get("/api/v1/info").then((info) => (store.info = info), failed).then(redraw);
+    get("/api/v1/info")
+      .then((info) => (store.info = info), failed)
+      .then(redraw);
     if (!message.resumed) for (const place of store.places.keys()) fetchPast(place);
     redraw();
   },
@@ -189,8 +210,10 @@ const on = {
   event(message) {
     const before = known.takeEvent(message);
     const who = list(message.robots);
-    if (!before && message.state !== "end") announce(`${who}: something unexpected in ${message.place}, ${nats(message.peak_surprise)}.`);
-    else if (message.state === "end" && before?.open) announce(`In ${message.place} all is as expected again where ${who} saw something.`);
+    if (!before && message.state !== "end")
+      announce(`${who}: something unexpected in ${message.place}, ${nats(message.peak_surprise)}.`);
+    else if (message.state === "end" && before?.open)
+      announce(`In ${message.place} all is as expected again where ${who} saw something.`);
     redraw();
   },
   reset() {
@@ -261,7 +284,10 @@ const link = new Link(on);
 setInterval(() => {
   if (!document.hidden) redraw();
 }, 500);
+let map_shown = false;
+new IntersectionObserver(([entry]) => (map_shown = entry.isIntersecting)).observe(byId("map"));
 setInterval(() => {
   const place = known.shownPlace();
-  if (place && !document.hidden && store.link !== "gone" && store.link !== "locked") fetchViews(place.name);
+  if (place && map_shown && !document.hidden && store.link !== "gone" && store.link !== "locked")
+    fetchViews(place.name);
 }, VIEWS_EVERY_MS);

@@ -44,7 +44,10 @@ byId("mode").addEventListener("change", async (event) => {
   objection = null;
   drawCamera();
   try {
-    await request(`${cameraPath(place.name, camera.robot, camera.camera)}/mode`, { method: "PUT", json: { mode: asked } });
+    await request(`${cameraPath(place.name, camera.robot, camera.camera)}/mode`, {
+      method: "PUT",
+      json: { mode: asked },
+    });
     camera.mode = asked;
   } catch (trouble) {
     objection = trouble.message;
@@ -80,14 +83,21 @@ export function drawCamera() {
   say(byId("camera-title"), `${camera.robot} ${camera.camera}`);
   const { state, words } = stateWords(camera);
   set(byId("camera-state"), "data-state", state);
-  say(byId("camera-state"), state === "live" && camera.fps !== undefined ? `live, ${camera.fps.toFixed(1)} fps` : words);
+  say(
+    byId("camera-state"),
+    state === "live" && camera.fps !== undefined ? `live, ${camera.fps.toFixed(1)} fps` : words,
+  );
   for (const picture of pictures) picture.of(place.name, camera);
   drawMode(camera);
   const refusal = refusalOf(camera);
   const reasons = Object.entries(camera.refused ?? {}).map(([code, count]) => `${code} ${count}`);
   const frame_ms = lastFrame(camera);
   facts(byId("camera-facts"), [
-    ["Surprise", `${nats(camera.max_surprise)}; ${threshold()} make a box`, camera.max_surprise > threshold() ? "surprise" : null],
+    [
+      "Surprise",
+      `${nats(camera.max_surprise)}; ${threshold()} make a box`,
+      camera.max_surprise > threshold() ? "surprise" : null,
+    ],
     ["Known", `${percent(camera.coverage)} of the picture`],
     frame_ms !== null && ["Last frame", `${span(now() - frame_ms)} ago, number ${camera.last_sequence}`],
     ["Frames", `${camera.frames.toLocaleString("en-GB")}, each ${Math.round(1000 * camera.processing_seconds)} ms`],

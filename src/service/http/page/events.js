@@ -45,7 +45,9 @@ function update(item, place, event) {
   say(parts.title, event.open ? kindWords(event) : (END_REASONS[event.end_reason] ?? "over"));
   say(
     parts.when,
-    event.open ? `since ${since(place, event)}` : `${clock(event.first_ms)}, for ${span(event.ended_ms - event.first_ms)}`,
+    event.open
+      ? `since ${since(place, event)}`
+      : `${clock(event.first_ms)}, for ${span(event.ended_ms - event.first_ms)}`,
   );
   facts(parts.facts, [
     ["Seen by", `${list(event.robots)}, ${count(event.sightings, "time")}`],

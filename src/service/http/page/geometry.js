@@ -63,7 +63,11 @@ export class Plane {
   stance({ position, orientation }) {
     const forward = rotate(orientation, [0, 0, 1]);
     const { right, top, height } = this.flat(forward);
-    return { ...this.flat(position), heading: Math.atan2(top, right), pitch: Math.asin(Math.max(-1, Math.min(1, height))) };
+    return {
+      ...this.flat(position),
+      heading: Math.atan2(top, right),
+      pitch: Math.asin(Math.max(-1, Math.min(1, height))),
+    };
   }
 
   /** The pose of an upright camera. */

@@ -42,7 +42,8 @@ function stances(place) {
 }
 
 /** Half the angle that a camera sees, in the plane. */
-const halfAngle = (camera) => (camera?.intrinsics ? Math.atan(camera.image.width / 2 / camera.intrinsics.fx) : Math.PI / 6);
+const halfAngle = (camera) =>
+  camera?.intrinsics ? Math.atan(camera.image.width / 2 / camera.intrinsics.fx) : Math.PI / 6;
 
 function grow(points) {
   if (!points.length) return;
@@ -125,7 +126,10 @@ function robot(place, camera) {
   return svg(
     "g",
     { class: "robot", "data-tone": tone, "data-state": stateOf(camera) },
-    svg("polyline", { class: "trail", points: trail.map((point) => `${view.x(point.right).toFixed(1)},${view.y(point.top).toFixed(1)}`).join(" ") }),
+    svg("polyline", {
+      class: "trail",
+      points: trail.map((point) => `${view.x(point.right).toFixed(1)},${view.y(point.top).toFixed(1)}`).join(" "),
+    }),
     svg("path", { class: "wedge", d: wedge(stance, halfAngle(camera), 54) }),
     svg("circle", { cx: x, cy: y, r: 6 }),
     svg("text", { x: back.x, y: back.y, "text-anchor": anchor }, camera.robot),
@@ -135,8 +139,16 @@ function robot(place, camera) {
 function marker(place, event) {
   const point = plane.flat(event.center);
   const [x, y] = [view.x(point.right), view.y(point.top)];
-  const group = svg("g", { class: "mark", "data-open": event.open, "data-kind": event.kind, "data-pointed": store.pointed === event.id });
-  group.append(svg("circle", { class: "halo", cx: x, cy: y, r: event.open ? 13 : 7 }), svg("circle", { cx: x, cy: y, r: event.open ? 5 : 3 }));
+  const group = svg("g", {
+    class: "mark",
+    "data-open": event.open,
+    "data-kind": event.kind,
+    "data-pointed": store.pointed === event.id,
+  });
+  group.append(
+    svg("circle", { class: "halo", cx: x, cy: y, r: event.open ? 13 : 7 }),
+    svg("circle", { cx: x, cy: y, r: event.open ? 5 : 3 }),
+  );
   if (event.open) {
     const label = svg("text", { x: x + 17, y: y + 4 }, clock(event.first_ms, false));
     if (x > view.width - 70) {
@@ -177,7 +189,12 @@ export function drawMap(place) {
   set(plot, "width", width);
   set(plot, "height", HEIGHT_PX);
   const cameras = [...place.cameras.values()].filter((camera) => camera.pose);
-  const nodes = [...grid(), viewpoints(place), ...cameras.map((camera) => robot(place, camera)), ...events.map((event) => marker(place, event))];
+  const nodes = [
+    ...grid(),
+    viewpoints(place),
+    ...cameras.map((camera) => robot(place, camera)),
+    ...events.map((event) => marker(place, event)),
+  ];
   if (asked) {
     const lens = halfAngle(lensOf(place));
     nodes.push(
@@ -202,15 +219,31 @@ function table(place, cameras, events) {
   const row = (key, what, point, heading, href) => ({ key, what, href, cells: [...point.map(metres), heading] });
   const rows = [
     ...cameras.map((camera) =>
-      row(cameraKey(camera), `${camera.robot} ${camera.camera}`, camera.pose.position, `${degrees(plane.stance(camera.pose).heading)}°`, cameraAddress(place.name, camera)),
+      row(
+        cameraKey(camera),
+        `${camera.robot} ${camera.camera}`,
+        camera.pose.position,
+        `${degrees(plane.stance(camera.pose).heading)}°`,
+        cameraAddress(place.name, camera),
+      ),
     ),
-    ...events.reverse().map((event) => row(event.id, `${event.open ? kindWords(event) : "ended"}, since ${clock(event.first_ms)}`, event.center, "")),
+    ...events
+      .reverse()
+      .map((event) =>
+        row(event.id, `${event.open ? kindWords(event) : "ended"}, since ${clock(event.first_ms)}`, event.center, ""),
+      ),
   ];
   keyed(
     byId("map-table"),
     rows,
     ({ key }) => key,
-    ({ href }) => el("tr", {}, el("th", { scope: "row" }, href ? el("a", { href }) : el("span")), ...[0, 1, 2, 3].map(() => el("td"))),
+    ({ href }) =>
+      el(
+        "tr",
+        {},
+        el("th", { scope: "row" }, href ? el("a", { href }) : el("span")),
+        ...[0, 1, 2, 3].map(() => el("td")),
+      ),
     (line, { what, cells }) => {
       say(line.firstElementChild.firstElementChild, what);
       cells.forEach((cell, index) => say(line.children[index + 1], cell));
@@ -229,7 +262,8 @@ function write(stance) {
     heading: degrees(stance.heading),
     pitch: degrees(stance.pitch),
   };
-  for (const [name, value] of Object.entries(values)) if (document.activeElement !== field(name)) field(name).value = value;
+  for (const [name, value] of Object.entries(values))
+    if (document.activeElement !== field(name)) field(name).value = value;
 }
 
 function read() {
@@ -281,7 +315,10 @@ async function ask() {
     const from = `from (${metres(asked.right)}, ${metres(asked.top)}) at ${metres(asked.height)} m, heading ${degrees(asked.heading)}°`;
     set(picture, "aria-label", `What the memory expects ${from}`);
     set(answer, "data-state", "answered");
-    say(byId("prior-words"), covered > 0 ? `Expected ${from}. ${percent(covered)} of it is known.` : `Nothing is known ${from}.`);
+    say(
+      byId("prior-words"),
+      covered > 0 ? `Expected ${from}. ${percent(covered)} of it is known.` : `Nothing is known ${from}.`,
+    );
   } catch (trouble) {
     set(answer, "data-state", "refused");
     say(byId("prior-words"), `No answer: ${trouble.message}`);
@@ -292,7 +329,10 @@ async function ask() {
 
 function pointOf(event) {
   const box = plot.getBoundingClientRect();
-  return [((event.clientX - box.left) / box.width) * view.width, ((event.clientY - box.top) / box.height) * view.height];
+  return [
+    ((event.clientX - box.left) / box.width) * view.width,
+    ((event.clientY - box.top) / box.height) * view.height,
+  ];
 }
 
 export function setUp(onChange) {

@@ -3,7 +3,7 @@
 
 import { el, svg } from "./dom.js";
 import { cameraPath, request } from "./service.js";
-import { store } from "./store.js";
+import { stateOf, store } from "./store.js";
 import { nats } from "./words.js";
 
 const AT_ONCE = 3;
@@ -22,7 +22,8 @@ const observer = new IntersectionObserver((entries) => {
   fetchSome();
 });
 
-let running = 0;
+/** What is being fetched, and whether that may take long. */
+const running = new Map();
 
 /** `place/robot/camera` to a map from sequence to boxes. */
 const boxesOf = new Map();
@@ -63,6 +64,8 @@ export class Picture {
     this.place = null;
     this.camera = null;
     this.sequence = null;
+    /** The camera's last frame when no picture came; another is tried with the next frame. */
+    this.missed = null;
     this.busy = false;
     this.after_ms = 0;
     this.canvas = el("canvas", { role: "img", width: 320, height: 240 });
@@ -84,7 +87,7 @@ export class Picture {
     const other = !this.camera || camerasKey(this.place, this.camera) !== camerasKey(place, camera);
     this.place = place;
     this.camera = camera;
-    if (other) this.forget();
+    if (other || camera.last_sequence === null) this.forget();
     if (camera.image) {
       const { width, height } = camera.image;
       this.screen.style.aspectRatio = `${width} / ${height}`;
@@ -93,6 +96,7 @@ export class Picture {
 
   forget() {
     this.sequence = null;
+    this.missed = null;
     this.after_ms = 0;
     this.wait.hidden = false;
     this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height);
@@ -110,6 +114,7 @@ export class Picture {
       this.camera !== null &&
       this.camera.last_sequence !== null &&
       this.camera.last_sequence !== this.sequence &&
+      this.camera.last_sequence !== this.missed &&
       Date.now() >= this.after_ms
     );
   }
@@ -126,6 +131,7 @@ export class Picture {
       // Another camera may be shown by now.
       if (this.camera && camerasKey(this.place, this.camera) === key) this.draw(bitmap, sequence, key);
     } catch {
+      this.missed = camera.last_sequence;
       pause = PAUSE_AFTER_TROUBLE_MS;
     }
     this.busy = false;
@@ -144,8 +150,13 @@ export class Picture {
     this.sequence = sequence;
     this.wait.hidden = true;
     const boxes = KINDS[this.kind].boxes ? boxesAt(key, sequence) : [];
-    const what = boxes.length ? `, ${boxes.length} surprising: ${boxes.map((box) => nats(box.peak_surprise)).join(", ")}` : "";
-    canvas.setAttribute("aria-label", `${camera.robot} ${camera.camera}: ${KINDS[this.kind].title}, frame ${sequence}${what}`);
+    const what = boxes.length
+      ? `, ${boxes.length} surprising: ${boxes.map((box) => nats(box.peak_surprise)).join(", ")}`
+      : "";
+    canvas.setAttribute(
+      "aria-label",
+      `${camera.robot} ${camera.camera}: ${KINDS[this.kind].title}, frame ${sequence}${what}`,
+    );
     this.drawBoxes(boxes);
   }
 
@@ -162,13 +173,17 @@ export class Picture {
           rx: 2,
         };
         // A dark line below the bright one: it is seen on anything.
-        return [svg("rect", { ...place, class: "box-under" }), svg("rect", { ...place, class: "box", "data-event": box.event_id })];
+        return [
+          svg("rect", { ...place, class: "box-under" }),
+          svg("rect", { ...place, class: "box", "data-event": box.event_id }),
+        ];
       }),
     );
   }
 }
 
-/** Starts what is due, the longest waiting first. */
+/** Starts what is due, the longest waiting first. A camera that sends nothing may keep its pictures waiting for long: those
+ *  take one place at most. */
 export function fetchSome() {
   if (document.hidden || store.link === "gone" || store.link === "locked") return;
   // Behind an open dialog nothing is looked at.
@@ -176,10 +191,12 @@ export function fetchSome() {
   const looked = (picture) => dialog === null || dialog.contains(picture.screen);
   const due = [...shown].filter((picture) => picture.due && looked(picture)).sort((a, b) => a.after_ms - b.after_ms);
   for (const picture of due) {
-    if (running >= AT_ONCE) return;
-    running += 1;
+    const slow = stateOf(picture.camera) !== "live";
+    if (running.size >= AT_ONCE) return;
+    if (slow && [...running.values()].includes(true)) continue;
+    running.set(picture, slow);
     picture.fetch().finally(() => {
-      running -= 1;
+      running.delete(picture);
       fetchSome();
     });
   }
@@ -196,7 +213,16 @@ export class Thumbnails {
       const image = el("img", { alt: "", loading: "lazy", decoding: "async" });
       image.addEventListener("error", () => (image.hidden = true));
       image.addEventListener("load", () => (image.hidden = false));
-      return { kind, image, figure: el("figure", { class: "thumb" }, el("div", { class: "screen" }, image), el("figcaption", {}, el("span", {}, kind === "seen" ? "saw" : "expected"))) };
+      return {
+        kind,
+        image,
+        figure: el(
+          "figure",
+          { class: "thumb" },
+          el("div", { class: "screen" }, image),
+          el("figcaption", {}, el("span", {}, kind === "seen" ? "saw" : "expected")),
+        ),
+      };
     });
     this.nodes = this.figures.map(({ figure }) => figure);
   }
@@ -211,4 +237,3 @@ export class Thumbnails {
     }
   }
 }
-

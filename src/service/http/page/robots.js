@@ -41,7 +41,12 @@ function make() {
     robot: el("strong"),
     camera: el("span", { class: "quiet" }),
     mode: el("span", { class: "badge" }),
-    state: el("p", { class: "state" }, el("span", { class: "dot", "aria-hidden": "true" }), el("span", { class: "text" })),
+    state: el(
+      "p",
+      { class: "state" },
+      el("span", { class: "dot", "aria-hidden": "true" }),
+      el("span", { class: "text" }),
+    ),
     pictures: [new Picture("frame"), new Picture("expected")],
     level: el("p", { class: "level" }),
     numbers: el("p", { class: "numbers" }),
@@ -92,13 +97,18 @@ function update(card, place, camera) {
 
 export function drawRobots(place) {
   const cameras = [...place.cameras.values()];
-  keyed(byId("cameras"), cameras, (camera) => `${place.name}/${cameraKey(camera)}`, make, (card, camera) =>
-    update(card, place, camera),
+  keyed(
+    byId("cameras"),
+    cameras,
+    (camera) => `${place.name}/${cameraKey(camera)}`,
+    make,
+    (card, camera) => update(card, place, camera),
   );
   const robots = new Set(cameras.map((camera) => camera.robot)).size;
   const live = cameras.filter((camera) => stateOf(camera) === "live").length;
   const words = [count(robots, "robot")];
   if (cameras.length !== robots) words.push(count(cameras.length, "camera"));
-  if (cameras.every((camera) => stateOf(camera) !== "unknown")) words.push(live === cameras.length ? "all live" : `${live} of ${cameras.length} live`);
+  if (cameras.every((camera) => stateOf(camera) !== "unknown"))
+    words.push(live === cameras.length ? "all live" : `${live} of ${cameras.length} live`);
   say(byId("cameras-count"), words.join(" · "));
 }

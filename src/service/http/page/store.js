@@ -36,7 +36,15 @@ export const now = () => Date.now() + store.ahead_ms;
 function placeOf(name) {
   let place = store.places.get(name);
   if (!place) {
-    place = { name, cameras: new Map(), events: new Map(), points: new Map(), trails: new Map(), views: [], viewpoints: 0 };
+    place = {
+      name,
+      cameras: new Map(),
+      events: new Map(),
+      points: new Map(),
+      trails: new Map(),
+      views: [],
+      status: {},
+    };
     store.places.set(name, place);
   }
   return place;
@@ -62,7 +70,7 @@ export function takeState({ now_ms, places }) {
 
 export function takePlace({ cameras, place: name, ...status }) {
   const place = placeOf(name);
-  Object.assign(place, status);
+  place.status = status;
   for (const camera of cameras) {
     const key = cameraKey(camera);
     const before = place.cameras.get(key);
@@ -195,7 +203,8 @@ export function stateOf(camera) {
 }
 
 /** Whether a frame was refused lately. */
-export const refusedLately = (camera) => camera.refused_grew_ms !== null && now() - camera.refused_grew_ms < REFUSED_LATELY_MS;
+export const refusedLately = (camera) =>
+  camera.refused_grew_ms !== null && now() - camera.refused_grew_ms < REFUSED_LATELY_MS;
 
 export const dropped = (camera) => (camera.frames_replaced ?? 0) + (camera.frames_lost ?? 0);
 

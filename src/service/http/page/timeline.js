@@ -19,13 +19,24 @@ const GAP = 5;
 const STEPS = [15, 30, 60, 120, 300, 600, 900, 1800];
 
 let seconds = 600;
+/** Where the pointer is, pixels; null beside the plot. */
+let pointer = null;
 
 export function setUp(redraw) {
   byId("history-span").addEventListener("change", (event) => {
     seconds = Number(event.target.value);
     redraw();
   });
-  new ResizeObserver(redraw).observe(byId("history").parentElement);
+  const plot = byId("history");
+  plot.addEventListener("pointermove", (event) => {
+    pointer = event.clientX - plot.getBoundingClientRect().left;
+    redraw();
+  });
+  plot.addEventListener("pointerleave", () => {
+    pointer = null;
+    redraw();
+  });
+  new ResizeObserver(redraw).observe(plot.parentElement);
 }
 
 /** Points of a time window, thinned to one a pixel column: its maximum. */
@@ -51,6 +62,13 @@ function path(points, x, y) {
     before = t;
   }
   return d;
+}
+
+/** The point at a time, if there is one. */
+function nearest(points, t) {
+  const far = (point) => Math.abs(point.t - t);
+  const best = points.reduce((best, point) => (best && far(best) <= far(point) ? best : point), null);
+  return best && far(best) <= Math.max(GAP, seconds / 100) ? best : null;
 }
 
 /** Each event gets the first lane that is free when it begins. */
@@ -98,25 +116,42 @@ export function drawTimeline(place) {
   for (let t = Math.ceil(from / step) * step; t <= now; t += step) {
     if (x(t) < LEFT + 14) continue;
     nodes.push(svg("line", { class: "grid", x1: x(t), x2: x(t), y1: TOP, y2: floor }));
-    if (x(t) < width - 22) nodes.push(svg("text", { class: "tick", x: x(t), y: floor + 16, "text-anchor": "middle" }, clock(t * 1000, step < 60)));
+    if (x(t) < width - 22)
+      nodes.push(
+        svg("text", { class: "tick", x: x(t), y: floor + 16, "text-anchor": "middle" }, clock(t * 1000, step < 60)),
+      );
   }
   const values = [0, ...[20, 50, 100, 200, 500, 1000].filter((value) => value <= greatest)].filter(
     (value, index, all) => value === 0 || index === all.length - 1 || y(value) - y(all[index + 1]) > 16,
   );
   for (const value of values) {
-    nodes.push(svg("line", { class: value ? "grid" : "axis", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) }));
+    nodes.push(
+      svg("line", { class: value ? "grid" : "axis", x1: LEFT, x2: width - RIGHT, y1: y(value), y2: y(value) }),
+    );
     nodes.push(svg("text", { class: "tick", x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, String(value)));
   }
   for (const { event, from: begin, to } of events.filter(({ event }) => event.kind === "change")) {
     const left = Math.max(LEFT, x(begin));
-    nodes.push(svg("rect", { class: "during", "data-pointed": store.pointed === event.id, x: left, y: TOP, width: Math.max(1, x(to) - left), height: CURVE }));
+    nodes.push(
+      svg("rect", {
+        class: "during",
+        "data-pointed": store.pointed === event.id,
+        x: left,
+        y: TOP,
+        width: Math.max(1, x(to) - left),
+        height: CURVE,
+      }),
+    );
   }
   nodes.push(svg("line", { class: "limit", x1: LEFT, x2: width - RIGHT, y1: y(limit), y2: y(limit) }));
-  nodes.push(svg("text", { class: "tick limit-word", x: LEFT - 8, y: y(limit) + 4, "text-anchor": "end" }, String(limit)));
+  nodes.push(
+    svg("text", { class: "tick limit-word", x: LEFT - 8, y: y(limit) + 4, "text-anchor": "end" }, String(limit)),
+  );
   for (const { points, tone } of series) {
     nodes.push(svg("path", { class: "curve", "data-tone": tone, d: path(points, x, y) }));
     const last = points.at(-1);
-    if (last && now - last.t < GAP) nodes.push(svg("circle", { class: "tip", "data-tone": tone, cx: x(last.t), cy: y(last.value), r: 3 }));
+    if (last && now - last.t < GAP)
+      nodes.push(svg("circle", { class: "tip", "data-tone": tone, cx: x(last.t), cy: y(last.value), r: 3 }));
   }
   for (const { event, from: begin, to, lane } of events) {
     const left = Math.max(LEFT, x(begin));
@@ -133,11 +168,31 @@ export function drawTimeline(place) {
         height: LANE - 5,
         rx: (LANE - 5) / 2,
       },
-      svg("title", {}, `${kindWords(event)}, from ${clock(event.first_ms)}${event.open ? "" : ` to ${clock(event.ended_ms)}`}`),
+      svg(
+        "title",
+        {},
+        `${kindWords(event)}, from ${clock(event.first_ms)}${event.open ? "" : ` to ${clock(event.ended_ms)}`}`,
+      ),
     );
     nodes.push(bar);
   }
-  if (rows) nodes.push(svg("text", { class: "tick", x: LEFT - 8, y: floor + AXIS + 7, "text-anchor": "end" }, "events"));
+  if (rows)
+    nodes.push(svg("text", { class: "tick", x: LEFT - 8, y: floor + AXIS + 7, "text-anchor": "end" }, "events"));
+  const pointed =
+    pointer !== null && pointer >= LEFT && pointer <= width - RIGHT
+      ? from + ((pointer - LEFT) / (width - LEFT - RIGHT)) * seconds
+      : null;
+  if (pointed !== null) {
+    nodes.push(svg("line", { class: "cursor", x1: pointer, x2: pointer, y1: TOP, y2: floor }));
+    const left = pointer > width - 90;
+    nodes.push(
+      svg(
+        "text",
+        { class: "cursor-word", x: pointer + (left ? -6 : 6), y: TOP + 11, "text-anchor": left ? "end" : "start" },
+        clock(pointed * 1000),
+      ),
+    );
+  }
   plot.replaceChildren(...nodes);
 
   keyed(
@@ -145,9 +200,10 @@ export function drawTimeline(place) {
     series,
     ({ key }) => key,
     () => el("li", {}, el("span", { class: "swatch", "aria-hidden": "true" }), el("span")),
-    (item, { camera, tone }) => {
+    (item, { camera, tone, points }) => {
       set(item, "data-tone", tone);
-      say(item.lastElementChild, `${camera.robot} ${camera.camera}`);
+      const there = pointed === null ? null : nearest(points, pointed);
+      say(item.lastElementChild, `${camera.robot} ${camera.camera}${there ? ` ${nats(there.value)}` : ""}`);
     },
   );
   const words = series.map(({ camera, points }) => {

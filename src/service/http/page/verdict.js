@@ -19,7 +19,9 @@ let thumbnails = null;
 /** Cameras that do not do what they should, in words. */
 function troubles(cameras) {
   const wrong = cameras.filter((camera) => stateOf(camera) !== "live");
-  const lines = wrong.slice(0, TROUBLES_MAX).map((camera) => `${camera.robot} ${camera.camera}: ${stateWords(camera).words}`);
+  const lines = wrong
+    .slice(0, TROUBLES_MAX)
+    .map((camera) => `${camera.robot} ${camera.camera}: ${stateWords(camera).words}`);
   return wrong.length > TROUBLES_MAX ? [...lines, `and ${wrong.length - TROUBLES_MAX} more`] : lines;
 }
 
@@ -28,7 +30,9 @@ function judge(place) {
   const open = openEvents(place);
   const live = cameras.filter((camera) => stateOf(camera) === "live");
   const trouble = store.link === "gone" ? [] : troubles(cameras);
-  if (open.length) {
+  const learning = live.length > 0 && live.every((camera) => camera.coverage < KNOWN);
+  // What nobody has seen is everything at first.
+  if (open.length && !(learning && open[0].kind === "unseen")) {
     const event = open[0];
     const who = list(event.robots);
     const sees = event.robots.length > 1 ? "see" : "sees";
@@ -36,27 +40,40 @@ function judge(place) {
     return {
       tone: event.kind === "unseen" ? "unseen" : "surprise",
       event,
-      title: event.kind === "unseen" ? `${who} ${sees} what nobody has seen before` : `${who} ${sees} something unexpected`,
+      title:
+        event.kind === "unseen" ? `${who} ${sees} what nobody has seen before` : `${who} ${sees} something unexpected`,
       since: `since ${since(place, event)} ago${others ? `, and ${others} more below` : ""}`,
       trouble,
     };
   }
   if (store.link === "gone") {
-    return { tone: "trouble", title: "Nothing unexpected when last heard of", since: "What has happened since then is not known.", trouble: [] };
+    return {
+      tone: "trouble",
+      title: "Nothing unexpected when last heard of",
+      since: "What has happened since then is not known.",
+      trouble: [],
+    };
   }
   if (!live.length) {
     const calm = { tone: "trouble", title: "Nobody is watching", trouble };
     return { ...calm, since: "No camera sends frames. Look whether the robots run and reach the service." };
   }
-  if (live.every((camera) => camera.coverage < KNOWN)) {
-    return { tone: "calm", title: "Getting to know the place", since: "What has not been seen before cannot surprise. Events come once most of the picture is known.", trouble };
+  if (learning) {
+    return {
+      tone: "calm",
+      title: "Getting to know the place",
+      since: "What has not been seen before cannot surprise. Events come once most of the picture is known.",
+      trouble,
+    };
   }
   const last = endedEvents(place)[0];
   const watching = `${list([...new Set(live.map((camera) => camera.robot))])} ${live.length === 1 ? "watches" : "watch"}`;
   return {
     tone: trouble.length ? "trouble" : "calm",
     title: trouble.length ? "Nothing unexpected, but not everybody watches" : "All is as expected",
-    since: last ? `${watching}. The last surprise ended at ${clock(last.ended_ms)}.` : `${watching}. Nothing has surprised since the service began.`,
+    since: last
+      ? `${watching}. The last surprise ended at ${clock(last.ended_ms)}.`
+      : `${watching}. Nothing has surprised since the service began.`,
     trouble,
   };
 }
@@ -82,7 +99,12 @@ export function drawVerdict(place) {
   const doing = byId("verdict-do");
   const lines = verdict.trouble.map((text) => ({ key: text.split(":")[0], text }));
   const camera = event && place.cameras.get(`${event.last?.robot}/${event.last?.camera}`);
-  if (camera) lines.push({ key: "link", text: `Look through ${camera.robot} ${camera.camera}`, href: cameraAddress(place.name, camera) });
+  if (camera)
+    lines.push({
+      key: "link",
+      text: `Look through ${camera.robot} ${camera.camera}`,
+      href: cameraAddress(place.name, camera),
+    });
   show(doing, lines.length > 0);
   keyed(
     doing,

@@ -23,14 +23,19 @@ export function span(ms) {
   return `${Math.floor(hours / 24)} days`;
 }
 
-export const count = (number, one, many = `${one}s`) => `${number.toLocaleString("en-GB")} ${number === 1 ? one : many}`;
+export const count = (number, one, many = `${one}s`) =>
+  `${number.toLocaleString("en-GB")} ${number === 1 ? one : many}`;
 
 export const nats = (value) => `${value.toFixed(value < 10 ? 1 : 0)} nats`;
 
 export const percent = (share) => `${Math.round(100 * share)} %`;
 
 // A true minus, and no minus before what rounds to nothing.
-export const metres = (value) => value.toFixed(2).replace(/^-(?!0\.00$)/, "\u2212").replace(/^-/, "");
+export const metres = (value) =>
+  value
+    .toFixed(2)
+    .replace(/^-(?!0\.00$)/, "\u2212")
+    .replace(/^-/, "");
 
 export const degrees = (radians) => Math.round((radians * 180) / Math.PI);
 
