@@ -112,13 +112,21 @@ function drawPlaces() {
     byId("places"),
     names,
     (name) => name,
-    (name) => el("a", { href: `#/${name}` }, el("span"), el("span", { class: "open" })),
+    (name) =>
+      el(
+        "a",
+        { href: `#/${name}` },
+        el("span"),
+        el("span", { class: "open", "aria-hidden": "true" }),
+        el("span", { class: "hidden" }),
+      ),
     (link, name) => {
       const open = known.openEvents(store.places.get(name)).length;
-      say(link.firstElementChild, name);
-      show(link.lastElementChild, open > 0);
-      say(link.lastElementChild, String(open));
-      set(link.lastElementChild, "aria-label", count(open, "open event"));
+      const [title, badge, words] = link.children;
+      say(title, name);
+      show(badge, open > 0);
+      say(badge, String(open));
+      say(words, open ? `, ${count(open, "open event")}` : "");
       set(link, "aria-current", name === shown ? "page" : null);
     },
   );

@@ -15,7 +15,7 @@ const END_REASONS = {
 };
 
 function make(redraw) {
-  const item = el("li", { class: "event", tabindex: "-1" });
+  const item = el("li", { class: "event" });
   item.parts = {
     thumbnails: new Thumbnails(),
     title: el("h3"),
