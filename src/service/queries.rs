@@ -115,7 +115,7 @@ async fn answer(questions: &Questions, query: &Query) {
         |key: &str| KeyExpr::try_from(key).is_ok_and(|one| query.key_expr().intersects(&one));
     let root = &questions.places.root;
     let mut matched = false;
-    // One camera by its name may be told its mode before it has sent anything.
+    // By its name a camera, or a place, may be told its mode before anything has come from it.
     let camera = CameraPath::parse(root, key.as_str())
         .filter(|path| !key.is_wild() && path.key(root, keys::MODE) == key.as_str());
     if let Some(camera) = camera {
@@ -123,6 +123,15 @@ async fn answer(questions: &Questions, query: &Query) {
             query,
             key.as_str(),
             mode_of(questions, &camera, query).await,
+        )
+        .await;
+        return;
+    }
+    if let Some((place, keys::MODE)) = keys::parse_memory(root, key.as_str()) {
+        reply(
+            query,
+            key.as_str(),
+            mode_of_place(questions, place, query).await,
         )
         .await;
         return;
@@ -195,6 +204,15 @@ async fn mode_of(
     payload(&encode::mode(mode), query.parameters(), None)
 }
 
+async fn mode_of_place(
+    questions: &Questions,
+    place: &str,
+    query: &Query,
+) -> Result<Held<Payload>, Refusal> {
+    let mode = questions.mode_of_place(place, mode_to_set(query)?).await?;
+    payload(&encode::mode(mode), query.parameters(), None)
+}
+
 fn mode_to_set(query: &Query) -> Result<Option<Mode>, Refusal> {
     query.parameters().get("set").map(mode).transpose()
 }
@@ -243,10 +261,7 @@ async fn reply_to(
             let request = forget_parameters(request, parameters)?;
             payload(&questions.forget(place, &request).await?, parameters, None)
         }
-        keys::MODE => {
-            let mode = questions.mode_of_place(name, mode_to_set(query)?).await?;
-            payload(&encode::mode(mode), parameters, None)
-        }
+        keys::MODE => mode_of_place(questions, name, query).await,
         _ => {
             let status = place.status.borrow().clone();
             let json = serde_json::to_vec(&*status).map_err(|error| {

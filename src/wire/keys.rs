@@ -113,6 +113,12 @@ pub fn memory(root: &str, place: &str, question: &str) -> String {
     format!("{root}/{place}/@memory/{question}")
 }
 
+/// Place and question of a [`memory`] key; `None` where the place is not an id.
+pub fn parse_memory<'a>(root: &str, key: &'a str) -> Option<(&'a str, &'a str)> {
+    let (place, question) = below(root, key)?.split_once("/@memory/")?;
+    is_id(place).then_some((place, question))
+}
+
 /// `application/protobuf;surprised.v1.<Message>`.
 pub fn encoding<M: prost::Name>() -> Encoding {
     Encoding::APPLICATION_PROTOBUF.with_schema(M::full_name())
