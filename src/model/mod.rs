@@ -12,4 +12,6 @@ pub mod refusal;
 
 pub mod report;
 
+pub mod event;
+
 pub mod viewpoint;

@@ -40,9 +40,22 @@ pub enum Ask {
     },
 }
 
+impl Ask {
+    /// One word, for counting.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Self::Prior { .. } => "prior",
+            Self::Evaluate { .. } => "evaluate",
+            Self::Views { .. } => "views",
+            Self::Snapshot { .. } => "picture",
+        }
+    }
+}
+
 /// What a camera saw last and what was thought of it, for people to look at.
 #[derive(Debug)]
 pub struct Snapshot {
+    pub report: Arc<proto::SurpriseReport>,
     pub frame: Arc<RgbImage>,
     pub expected: RgbImage,
     /// Nats a pixel.

@@ -1,5 +1,7 @@
 //! How the service is reached: Zenoh in, Zenoh out, HTTP beside it, and one worker thread a place in between.
 
+pub mod access;
+
 pub mod session;
 
 pub mod client;
@@ -24,6 +26,12 @@ mod ask;
 
 mod status;
 
+mod events;
+
+mod live;
+
+mod metrics;
+
 mod queries;
 
 mod http;
@@ -34,8 +42,10 @@ use tokio::{net::TcpListener, sync::mpsc, time::timeout};
 use zenoh::query::Queryable;
 
 use self::{
+    access::HttpAccess,
     http::{Parts, Server},
     ingest::Ingest,
+    live::NEWS_MAX,
     places::Places,
     readiness::Readiness,
     session::ZenohOptions,
@@ -58,6 +68,7 @@ pub struct Options {
     pub root: String,
     /// `None`: no HTTP.
     pub http: Option<SocketAddr>,
+    pub http_access: HttpAccess,
     pub zenoh: ZenohOptions,
 }
 
@@ -86,7 +97,7 @@ pub enum ServeError {
 pub struct Service {
     places: Arc<Places>,
     ingest: Ingest,
-    queryable: Queryable<()>,
+    queryables: [Queryable<()>; 2],
     http: Option<Server>,
     readiness: Readiness,
     failures: mpsc::UnboundedReceiver<String>,
@@ -112,11 +123,15 @@ impl Service {
             engine,
             root,
             http,
+            http_access,
             zenoh,
         } = options;
         settings.validate()?;
         if !keys::is_root(&root) {
             return Err(ConfigError::Root(root).into());
+        }
+        if let Some(addr) = http {
+            http_access.check(addr)?;
         }
         let config = zenoh.config(Limits::new(&settings).message_bytes_max())?;
 
@@ -150,11 +165,21 @@ impl Service {
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let (places, starts) = Places::new(settings, engine, root.into(), session, pool, failed);
+        let (news, told) = mpsc::channel(NEWS_MAX);
+        let (places, starts) = Places::new(
+            settings,
+            engine,
+            root.into(),
+            session,
+            pool,
+            failed,
+            http.is_some().then_some(news),
+        );
         let places = Arc::new(places);
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
         let queryable =
             queries::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
+        let events = events::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
         drop(workers_latch);
 
         let http = match listener {
@@ -164,8 +189,9 @@ impl Service {
                     places: places.clone(),
                     counters: ingest.counters.clone(),
                     locators: locators.clone(),
+                    live: live::start(&places, told),
                 };
-                let server = http::start(listener, readiness.clone(), parts)
+                let server = http::start(listener, readiness.clone(), http_access, parts)
                     .map_err(|error| ServeError::Http { addr, error })?;
                 tracing::info!("HTTP on http://{}", server.addr);
                 Some(server)
@@ -185,7 +211,7 @@ impl Service {
         Ok(Self {
             places,
             ingest,
-            queryable,
+            queryables: [queryable, events],
             http,
             readiness,
             failures,
@@ -219,7 +245,7 @@ impl Service {
         let Self {
             places,
             ingest,
-            queryable,
+            queryables,
             http,
             readiness,
             ..
@@ -229,7 +255,7 @@ impl Service {
         let finish = async move {
             // Nothing new comes in; then what has come is finished; then everybody is told.
             drop(ingest);
-            drop(queryable);
+            drop(queryables);
             // Closing joins threads.
             if let Err(error) = tokio::task::spawn_blocking(move || places.close()).await {
                 tracing::error!("the places did not close: {error}");

@@ -183,10 +183,19 @@ async fn reply_to(
 /// `busy`, or whatever the worker says.
 pub async fn ask<T>(place: &Place, make: impl FnOnce(Answer<T>) -> Ask) -> Result<T, Refusal> {
     let (sender, answer) = oneshot::channel();
-    place.inbox.put_ask(make(sender)).map_err(|_full| busy())?;
-    answer
-        .await
-        .unwrap_or_else(|_| Err(Refusal::new("closing", "the service is stopping")))
+    let ask = make(sender);
+    let kind = ask.kind();
+    let answered = match place.inbox.put_ask(ask) {
+        Err(_full) => Err(busy()),
+        Ok(()) => answer
+            .await
+            .unwrap_or_else(|_| Err(Refusal::new("closing", "the service is stopping"))),
+    };
+    let outcome = answered
+        .as_ref()
+        .map_or_else(|refusal| refusal.code, |_| "ok");
+    place.metrics.query(kind, outcome);
+    answered
 }
 
 fn payload<M: encode::Named>(message: &M, parameters: &Parameters<'_>) -> Result<Payload, Refusal> {
