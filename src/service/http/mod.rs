@@ -46,7 +46,7 @@ use axum::{
 };
 use prometheus_client::registry::Registry;
 use serde_json::{Value, json};
-use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
+use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle, time::timeout};
 use tower_http::{limit::RequestBodyLimitLayer, timeout::TimeoutLayer};
 use utoipa::{OpenApi, openapi};
 use utoipa_axum::{router::OpenApiRouter, routes};
@@ -60,6 +60,8 @@ use crate::wire::{proto, schema};
 
 /// A picture waits for the camera's next frame at most.
 const REQUEST_WITHIN: Duration = Duration::from_secs(10);
+/// Requests under way when the service stops.
+const FINISH_WITHIN: Duration = Duration::from_secs(2);
 const BODY_BYTES_MAX: usize = 1 << 20;
 const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
@@ -96,15 +98,18 @@ pub struct Server {
 }
 
 impl Server {
-    /// Lets requests under way finish; those who watch are let go.
+    /// Lets requests under way finish, for a while; those who watch are let go.
     pub async fn stop(mut self) {
         self.live.close();
         // The receiver is gone only if the task is.
         if let Some(stop) = self.stop.take() {
             let _ = stop.send(());
         }
-        if let Err(error) = self.task.await {
-            tracing::warn!("the HTTP server failed: {error}");
+        match timeout(FINISH_WITHIN, &mut self.task).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!("the HTTP server failed: {error}"),
+            // Somebody does not read what was sent.
+            Err(_) => self.task.abort(),
         }
     }
 }
