@@ -13,12 +13,13 @@ use crate::{
         cpu::{CpuEngine, Observation, RecallView, Score},
     },
     isa::Isa,
-    memory::{Memory, visit::Visit},
+    memory::{Memory, forget::Forgetting, visit::Visit},
     model::{
         belief::Record,
         camera::Intrinsics,
         event::Event,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
+        mode::Mode,
         pose::Pose,
         report::Report,
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
@@ -31,8 +32,10 @@ use crate::{
             merge::VIEWS_MAX,
             prior::{self, Prior},
         },
+        next_view::{self, Promise},
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
         select::select_into,
+        update::UpdateRules,
     },
 };
 
@@ -106,6 +109,7 @@ pub struct Pipeline {
     sides_depth: SidesDepth,
     engine: Engine,
     refiner: PoseRefiner,
+    update_rules: UpdateRules,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
     events: Events,
@@ -142,6 +146,7 @@ impl Pipeline {
             engine,
             pool,
             refiner: PoseRefiner::new(isa),
+            update_rules: UpdateRules::new(&settings),
             memory: Memory::default(),
             cameras: HashMap::new(),
             events: Events::default(),
@@ -193,34 +198,54 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
-        self.process_staged(frame, &mut |_| {})
+        self.process_in(Mode::Learn, frame)
+    }
+
+    /// Compares a frame with the memory, which it changes as the mode says. Regions are followed in every mode.
+    ///
+    /// # Errors
+    /// A frame that cannot be used; nothing has changed then.
+    pub fn process_in(&mut self, mode: Mode, frame: &Frame) -> Result<Report, FrameError> {
+        self.process_staged(mode, frame, &mut |_| {})
     }
 
     /// The same, telling `ended` of every stage.
     ///
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
-    pub fn process_staged(&mut self, frame: &Frame, ended: Ended) -> Result<Report, FrameError> {
+    pub fn process_staged(
+        &mut self,
+        mode: Mode,
+        frame: &Frame,
+        ended: Ended,
+    ) -> Result<Report, FrameError> {
         self.depth(frame)?;
         ended(Stage::Depth);
         let mut camera = match self.cameras.get_mut(&frame.source) {
             Some(camera) => std::mem::take(camera),
             None => Camera::default(),
         };
-        let looked = self.look(frame, &mut camera.visit, true, ended);
+        let before = (mode == Mode::Freeze).then(|| camera.visit.clone());
+        let learn = mode == Mode::Learn;
+        let looked = self.look(frame, &mut camera.visit, learn, ended);
         let looked = looked.map(|mut report| {
             camera
                 .follower
                 .follow(&mut report.regions, &mut self.last_region_id);
             report.events = self.follow_events(frame, &mut report);
             ended(Stage::Attend);
-            let id = self.remember(frame, &report.world_from_camera);
-            ended(Stage::Remember);
-            camera.visit.wrote(id);
-            report.learned = true;
-            report.viewpoint_id = Some(id);
+            if learn {
+                let id = self.remember(frame, &report.world_from_camera);
+                camera.visit.wrote(id);
+                report.viewpoint_id = Some(id);
+                ended(Stage::Remember);
+            }
+            report.learned = learn;
             report
         });
+        if let Some(before) = before {
+            camera.visit = before;
+        }
         match self.cameras.get_mut(&frame.source) {
             Some(slot) => *slot = camera,
             None => {
@@ -321,8 +346,24 @@ impl Pipeline {
     }
 
     /// Forgets what is known about a camera beside the viewpoints it wrote.
-    pub fn forget(&mut self, source: &Source) {
+    pub fn forget_camera(&mut self, source: &Source) {
         self.cameras.remove(source);
+    }
+
+    /// Goes on forgetting, over at most so many viewpoints; whether all is done.
+    pub fn forget(&mut self, forgetting: &mut Forgetting, viewpoints_max: usize) -> bool {
+        let memory = &mut self.memory;
+        let done = self
+            .pool
+            .install(|| memory.forget(forgetting, viewpoints_max));
+        self.engine.forget();
+        done
+    }
+
+    /// What an observation from a pose is expected to tell. One pass of the engine.
+    pub fn promise(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> Promise {
+        let at = self.prior(intrinsics, world_from_camera);
+        next_view::promise(&at.prior, &self.update_rules)
     }
 
     /// Compares a checked frame with what is expected; nothing is learnt yet.

@@ -373,6 +373,11 @@ impl Collector for OfPlaces {
             "Viewpoints forgotten because the memory was full",
             |place| place.totals.replaced_for_room,
         )?;
+        out.counters(
+            "ask_passes",
+            "Passes of the engine that questions have taken",
+            |place| place.totals.ask_passes,
+        )?;
         out.gauges("events_open", "Events that last", |place| {
             place.totals.open_events as i64
         })?;
@@ -533,6 +538,16 @@ impl Out<'_, '_> {
                 "refused_at_the_door",
                 "Samples refused because there are too many places or cameras",
                 &counters.refused,
+            ),
+            (
+                "questions_busy",
+                "Questions refused because too many bytes of them were under way",
+                &counters.questions_busy,
+            ),
+            (
+                "questions_late",
+                "Questions that had no answer in time",
+                &counters.questions_late,
             ),
             (
                 "queries_dropped",

@@ -24,6 +24,8 @@ mod publish;
 
 mod ask;
 
+mod turns;
+
 mod status;
 
 mod events;
@@ -31,6 +33,7 @@ mod events;
 mod live;
 
 mod metrics;
+mod questions;
 
 mod queries;
 
@@ -47,6 +50,7 @@ use self::{
     ingest::Ingest,
     live::NEWS_MAX,
     places::Places,
+    questions::Questions,
     readiness::Readiness,
     session::ZenohOptions,
 };
@@ -97,7 +101,7 @@ pub enum ServeError {
 pub struct Service {
     places: Arc<Places>,
     ingest: Ingest,
-    queryables: [Queryable<()>; 2],
+    queryables: Vec<Queryable<()>>,
     http: Option<Server>,
     readiness: Readiness,
     failures: mpsc::UnboundedReceiver<String>,
@@ -177,9 +181,12 @@ impl Service {
         );
         let places = Arc::new(places);
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
-        let queryable =
-            queries::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
-        let events = events::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
+        let questions = Arc::new(Questions::new(places.clone(), ingest.counters.clone()));
+        let mut queryables: Vec<_> = queries::start(&questions, &ingest.counters)
+            .map_err(ServeError::Zenoh)?
+            .into();
+        let of_events = events::start(&places, ingest.counters.clone());
+        queryables.push(of_events.map_err(ServeError::Zenoh)?);
         drop(workers_latch);
 
         let http = match listener {
@@ -190,6 +197,7 @@ impl Service {
                     counters: ingest.counters.clone(),
                     locators: locators.clone(),
                     live: live::start(&places, told),
+                    questions,
                 };
                 let server = http::start(listener, readiness.clone(), http_access, parts)
                     .map_err(|error| ServeError::Http { addr, error })?;
@@ -211,7 +219,7 @@ impl Service {
         Ok(Self {
             places,
             ingest,
-            queryables: [queryable, events],
+            queryables,
             http,
             readiness,
             failures,

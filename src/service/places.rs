@@ -38,7 +38,6 @@ pub struct Place {
     pub inbox: Arc<Inbox>,
     pub status: watch::Receiver<Arc<PlaceStatus>>,
     pub events: watch::Receiver<Arc<PlaceEvents>>,
-    pub metrics: Arc<Metrics>,
     /// Taken by the worker when it starts.
     publish: Mutex<Option<Publish>>,
 }
@@ -148,7 +147,6 @@ impl Places {
             inbox: Arc::default(),
             status,
             events,
-            metrics: self.metrics.clone(),
             publish: Mutex::new(Some(Publish {
                 status: publish_status,
                 events: publish_events,

@@ -6,7 +6,11 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::inbox::{InboxCounters, SlotCounters};
-use crate::{engine::gpu::Counters, model::camera::Intrinsics, wire::proto};
+use crate::{
+    engine::gpu::Counters,
+    model::{camera::Intrinsics, mode::Mode},
+    wire::proto,
+};
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct PlaceStatus {
@@ -35,7 +39,14 @@ pub struct PlaceTotals {
     pub memory_bytes_max: usize,
     /// Viewpoints forgotten because the memory was full.
     pub replaced_for_room: u64,
+    /// What cameras begin with.
+    #[schema(value_type = String)]
+    pub mode: Mode,
     pub asks_answered: u64,
+    /// Passes of the engine that asks have taken.
+    pub ask_passes: u64,
+    /// Asks whose askers had gone when their turn came.
+    pub asks_abandoned: u64,
     /// What computes: the processor, or the name of a graphics card.
     pub engine: String,
     /// Events that last.
@@ -50,6 +61,8 @@ pub struct CameraStatus {
     pub camera: String,
     /// Its liveliness token is there.
     pub live: bool,
+    #[schema(value_type = String)]
+    pub mode: Mode,
     /// Processed.
     pub frames: u64,
     /// Missing in the robot's sequence although nothing here replaced them.

@@ -25,3 +25,5 @@ pub mod surprise;
 pub mod attend;
 
 pub mod events;
+
+pub mod next_view;

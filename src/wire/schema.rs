@@ -3,33 +3,35 @@
 use prost_reflect::{FieldDescriptor, Kind, MessageDescriptor};
 use serde_json::{Map, Value, json};
 
-use super::encode::{DESCRIPTORS, Named};
+use super::encode::{Named, descriptor};
 
-/// Of a message, with those in it.
-pub fn json_schema<M: Named>() -> Value {
-    let message = DESCRIPTORS
-        .get_message_by_name(&M::full_name())
-        .expect("every message of the contract is described");
-    of_message(&message)
+/// Of a message that is sent, with those in it: it has all its fields.
+pub fn reply<M: Named>() -> Value {
+    of_message(&descriptor::<M>(), true)
 }
 
-fn of_message(message: &MessageDescriptor) -> Value {
+/// Of a message that is read: what is not there has its default.
+pub fn request<M: Named>() -> Value {
+    of_message(&descriptor::<M>(), false)
+}
+
+fn of_message(message: &MessageDescriptor, whole: bool) -> Value {
     if message.full_name() == "google.protobuf.Timestamp" {
         return json!({ "type": "string", "format": "date-time" });
     }
     let fields = || message.fields();
     let properties: Map<String, Value> = fields()
-        .map(|field| (field.name().to_owned(), of_field(&field)))
+        .map(|field| (field.name().to_owned(), of_field(&field, whole)))
         .collect();
     // Messages may be absent.
     let required: Vec<String> = fields()
-        .filter(|field| !field.supports_presence())
+        .filter(|field| whole && !field.supports_presence())
         .map(|field| field.name().to_owned())
         .collect();
     json!({ "type": "object", "properties": properties, "required": required })
 }
 
-fn of_field(field: &FieldDescriptor) -> Value {
+fn of_field(field: &FieldDescriptor, whole: bool) -> Value {
     let one = match field.kind() {
         Kind::Double | Kind::Float => json!({ "type": "number" }),
         Kind::Uint32 | Kind::Fixed32 => json!({ "type": "integer", "minimum": 0 }),
@@ -41,7 +43,7 @@ fn of_field(field: &FieldDescriptor) -> Value {
         Kind::Bool => json!({ "type": "boolean" }),
         Kind::String | Kind::Enum(_) => json!({ "type": "string" }),
         Kind::Bytes => json!({ "type": "string", "contentEncoding": "base64" }),
-        Kind::Message(message) => of_message(&message),
+        Kind::Message(message) => of_message(&message, whole),
     };
     if field.is_list() {
         json!({ "type": "array", "items": one })

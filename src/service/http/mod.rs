@@ -17,11 +17,15 @@
 //! GET  /api/v1/places/{place}/timeline              surprise of the last quarter of an hour
 //! GET  /api/v1/places/{place}/robots/{robot}/{camera}            the camera's status and last report
 //! GET  .../robots/{robot}/{camera}/{frame|expected|surprise|uncertainty}.png
+//! POST /api/v1/places/{place}/{prior|evaluate|next_view|forget}  questions, see [`asks`]
+//! GET  PUT /api/v1/places/{place}/mode, .../robots/{robot}/{camera}/mode
 //! ```
 //!
 //! Status is read from published snapshots; views and pictures are asks to the place's worker. Errors are
 //! `application/problem+json`. Everything but the first two, the description and signing in needs the token if there is
 //! one.
+
+mod asks;
 
 mod door;
 
@@ -39,7 +43,7 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use axum::{
     Router,
-    extract::{FromRef, State},
+    extract::{DefaultBodyLimit, FromRef, State},
     http::{StatusCode, header},
     middleware,
     response::{IntoResponse, Response},
@@ -47,17 +51,15 @@ use axum::{
 use prometheus_client::registry::Registry;
 use serde_json::{Value, json};
 use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle, time::timeout};
-use tower_http::{limit::RequestBodyLimitLayer, timeout::TimeoutLayer};
+use tower_http::timeout::TimeoutLayer;
 use utoipa::{OpenApi, openapi};
 use utoipa_axum::{router::OpenApiRouter, routes};
 
 use self::{door::Door, limits::LimitedListener, problem::Problem};
 use super::{
     access::HttpAccess, ingest::IngestCounters, live::Live, metrics, places::Places,
-    readiness::Readiness,
+    questions::Questions, readiness::Readiness,
 };
-use crate::wire::{proto, schema};
-
 /// A picture waits for the camera's next frame at most.
 const REQUEST_WITHIN: Duration = Duration::from_secs(10);
 /// Requests under way when the service stops.
@@ -72,6 +74,7 @@ pub struct Parts {
     pub counters: Arc<IngestCounters>,
     pub locators: Vec<String>,
     pub live: Arc<Live>,
+    pub questions: Arc<Questions>,
 }
 
 #[derive(Clone)]
@@ -166,6 +169,7 @@ pub fn start(
     tags(
         (name = "service", description = "The process"),
         (name = "places", description = "What is known and seen"),
+        (name = "memory", description = "What is remembered: questions, modes, forgetting"),
         (name = "events", description = "What has happened"),
         (name = "session", description = "Signing in with a browser"),
     )
@@ -178,7 +182,6 @@ fn router(app: App) -> Router {
         .routes(routes!(info))
         .routes(routes!(places::list))
         .routes(routes!(places::status))
-        .routes(routes!(places::views))
         .routes(routes!(places::camera))
         .routes(routes!(places::picture))
         .routes(routes!(watch::stream))
@@ -186,6 +189,7 @@ fn router(app: App) -> Router {
         .routes(routes!(watch::event))
         .routes(routes!(watch::event_picture))
         .routes(routes!(watch::timeline))
+        .merge(asks::routes())
         .route_layer(middleware::from_fn_with_state(
             app.door.clone(),
             door::token,
@@ -216,7 +220,7 @@ fn router(app: App) -> Router {
             StatusCode::GATEWAY_TIMEOUT,
             REQUEST_WITHIN,
         ))
-        .layer(RequestBodyLimitLayer::new(BODY_BYTES_MAX))
+        .layer(DefaultBodyLimit::max(BODY_BYTES_MAX))
         .layer(middleware::from_fn_with_state(
             app.door.clone(),
             door::guard,
@@ -233,24 +237,46 @@ fn described(description: openapi::OpenApi) -> Value {
         "session": { "type": "apiKey", "in": "cookie", "name": door::COOKIE },
     });
     let schemas = &mut components["schemas"];
-    schemas["Event"] = schema::json_schema::<proto::Event>();
-    schemas["SurpriseReport"] = schema::json_schema::<proto::SurpriseReport>();
-    schemas["ViewsReply"] = schema::json_schema::<proto::ViewsReply>();
+    for (name, schema) in message::schemas() {
+        schemas[name] = schema;
+    }
     description
 }
 
 /// Stand for messages of the contract, whose own descriptions take their places.
 mod message {
+    use serde_json::Value;
     use utoipa::ToSchema;
 
-    #[derive(ToSchema)]
-    pub struct Event {}
+    use crate::wire::{proto, schema};
 
-    #[derive(ToSchema)]
-    pub struct SurpriseReport {}
+    macro_rules! messages {
+        ($($direction:ident $name:ident),* $(,)?) => {
+            $(
+                #[derive(ToSchema)]
+                pub struct $name {}
+            )*
 
-    #[derive(ToSchema)]
-    pub struct ViewsReply {}
+            pub fn schemas() -> Vec<(&'static str, Value)> {
+                vec![$((stringify!($name), schema::$direction::<proto::$name>())),*]
+            }
+        };
+    }
+
+    messages!(
+        reply Event,
+        reply SurpriseReport,
+        reply ViewsReply,
+        request PriorRequest,
+        reply PriorReply,
+        request EvaluateRequest,
+        reply EvaluateReply,
+        request NextViewRequest,
+        reply NextViewReply,
+        request ForgetRequest,
+        reply ForgetReply,
+        request Mode,
+    );
 }
 
 /// Whether the process answers

@@ -20,10 +20,9 @@ use super::{
 use crate::{
     model::frame::{RgbImage, Source},
     service::{
-        ask::{Ask, Snapshot},
+        ask::Snapshot,
         live::{CameraState, PlaceState},
         places::Place,
-        queries::ask,
     },
     wire::{encode, picture as draw},
 };
@@ -76,25 +75,6 @@ pub async fn status(
 ) -> Result<axum::Json<PlaceState>, Problem> {
     let status = known(&app, &place)?.status.borrow().clone();
     Ok(axum::Json(app.parts.live.state_of(&status)))
-}
-
-/// The memory's viewpoints
-#[utoipa::path(get, path = "/api/v1/places/{place}/views", tag = "places",
-    params(("place" = String, Path)),
-    responses(
-        (status = 200, body = message::ViewsReply),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document,
-            content_type = "application/problem+json"),
-    ))]
-pub async fn views(
-    State(app): State<App>,
-    Path(place): Path<String>,
-) -> Result<axum::Json<Value>, Problem> {
-    let place = known(&app, &place)?;
-    let views = ask(&place, |answer| Ask::Views { answer }).await?;
-    Ok(axum::Json(encode::json(&views)))
 }
 
 /// For the description only.
@@ -169,7 +149,7 @@ pub async fn picture(
         robot: robot.into(),
         camera: camera.into(),
     };
-    let snapshot = ask(&place, |answer| Ask::Snapshot { camera, answer }).await?;
+    let snapshot = app.parts.questions.picture(&place, camera).await?;
     let report = snapshot.report.clone();
     let png = tokio::task::spawn_blocking(move || draw::png(&draw(&snapshot)))
         .await
