@@ -199,8 +199,12 @@ const on = {
     const { updated } = known.hello(message);
     // Another version has another page.
     if (updated) location.reload();
-    get("/api/v1/info")
-      .then((info) => (store.info = info), failed)
+    Promise.all([get("/api/v1/info"), get("/api/v1/places")])
+      .then(([info]) => {
+        store.info = info;
+        // The stream says nothing where there is nothing.
+        store.told = true;
+      }, failed)
       .then(redraw);
     if (!message.resumed) for (const place of store.places.keys()) fetchPast(place);
     redraw();

@@ -57,7 +57,10 @@ export function hello({ boot, version, now_ms }) {
   store.boot = boot;
   store.version = version;
   store.ahead_ms = now_ms - Date.now();
-  if (restarted) store.places.clear();
+  if (restarted) {
+    store.places.clear();
+    store.told = false;
+  }
   return { restarted, updated };
 }
 
