@@ -101,6 +101,8 @@ struct Node {
     /// Leaf: its primitives. Branch: `count` is 0, the left child follows, `start` is the right one.
     start: u32,
     count: u32,
+    /// Branch: the left child lies lower along it.
+    axis: u8,
     hides_lamp: bool,
     hides_sky: bool,
 }
@@ -152,6 +154,8 @@ impl Scene {
         let mut t_max = t_max;
         self.walk(
             |node, t_max: f64| enters(&node.bounds, ray, &inverse, t_max),
+            // The nearer half first: what it holds may hide the other.
+            |axis| ray.direction[axis] >= 0.0,
             &mut t_max,
             |index, t_max| {
                 let primitive = &self.primitives[index];
@@ -180,6 +184,7 @@ impl Scene {
                 };
                 any && may_hide(&node.bounds)
             },
+            |_| true,
             &mut (),
             |index, _| {
                 if self.hides[index][light as usize] && may_hide(&self.bounds[index]) {
@@ -192,6 +197,7 @@ impl Scene {
     fn walk<S: Copy>(
         &self,
         enter: impl Fn(&Node, S) -> bool,
+        left_first: impl Fn(usize) -> bool,
         state: &mut S,
         mut visit: impl FnMut(usize, &mut S),
     ) {
@@ -209,8 +215,14 @@ impl Scene {
                     visit(primitive as usize, state);
                 }
             } else {
-                stack[depth] = node.start;
-                stack[depth + 1] = index + 1;
+                let (left, right) = (index + 1, node.start);
+                let (next, later) = if left_first(usize::from(node.axis)) {
+                    (left, right)
+                } else {
+                    (right, left)
+                };
+                stack[depth] = later;
+                stack[depth + 1] = next;
                 depth += 2;
             }
         }
@@ -227,6 +239,7 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
         bounds,
         start: offset,
         count: primitives.len() as u32,
+        axis: 0,
         hides_lamp: primitives
             .iter()
             .any(|primitive| primitive.hides(Light::Lamp)),
@@ -249,6 +262,7 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
     build(left, offset, nodes);
     nodes[index].start = nodes.len() as u32;
     nodes[index].count = 0;
+    nodes[index].axis = axis as u8;
     build(right, offset + middle as u32, nodes);
 }
 
