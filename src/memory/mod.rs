@@ -1,4 +1,6 @@
-//! What a place remembers: its viewpoints, how they grow and which one a new posterior replaces.
+//! What a place remembers: its viewpoints, how they grow, which one a new posterior replaces, and what is forgotten.
+
+pub mod forget;
 
 pub mod visit;
 

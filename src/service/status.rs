@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc};
 use serde::Serialize;
 
 use super::inbox::SlotCounters;
-use crate::wire::proto;
+use crate::{model::mode::Mode, wire::proto};
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct PlaceStatus {
@@ -17,9 +17,15 @@ pub struct PlaceStatus {
     pub memory_bytes_max: usize,
     /// Viewpoints forgotten because the memory was full.
     pub replaced_for_room: u64,
+    /// What cameras begin with.
+    pub mode: Mode,
     pub asks_answered: u64,
+    /// Passes of the engine that asks have taken.
+    pub ask_passes: u64,
     /// Asks refused because the queue was full.
     pub asks_busy: u64,
+    /// Asks whose askers had gone when their turn came.
+    pub asks_abandoned: u64,
     pub cameras: Vec<CameraStatus>,
 }
 
@@ -29,6 +35,7 @@ pub struct CameraStatus {
     pub camera: String,
     /// Its liveliness token is there.
     pub live: bool,
+    pub mode: Mode,
     /// Processed.
     pub frames: u64,
     /// Missing in the robot's sequence although nothing here replaced them.
