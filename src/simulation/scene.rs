@@ -229,7 +229,7 @@ impl Scene {
     }
 }
 
-/// Halves at the median along the longest side: at most 2 * log2(n) open branches.
+/// A part has at least an eighth of the whole: with 64 open branches there is room for ten thousand primitives.
 fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
     let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
         bounds.joined(&primitive.shape.bounds())
@@ -250,20 +250,47 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
     if primitives.len() <= LEAF {
         return;
     }
-    let centers = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
-        bounds.joined(&Bounds::of([primitive.shape.bounds().center()]))
-    });
-    let axis = centers.half().imax();
-    let middle = primitives.len() / 2;
-    primitives.select_nth_unstable_by(middle, |a, b| {
-        a.shape.bounds().center()[axis].total_cmp(&b.shape.bounds().center()[axis])
-    });
+    let (axis, middle) = best_split(primitives);
+    sort_along(primitives, axis);
     let (left, right) = primitives.split_at_mut(middle);
     build(left, offset, nodes);
     nodes[index].start = nodes.len() as u32;
     nodes[index].count = 0;
     nodes[index].axis = axis as u8;
     build(right, offset + middle as u32, nodes);
+}
+
+fn sort_along(primitives: &mut [Primitive], axis: usize) {
+    primitives.sort_by(|a, b| {
+        let center = |primitive: &Primitive| primitive.shape.bounds().center()[axis];
+        center(a).total_cmp(&center(b))
+    });
+}
+
+/// The axis and the number of primitives on its lower side for which a ray is expected to meet the fewest: a part is
+/// entered in proportion to its surface.
+fn best_split(primitives: &mut [Primitive]) -> (usize, usize) {
+    let count = primitives.len();
+    let least = (count / 8).max(1);
+    let mut best = (f64::INFINITY, 0, count / 2);
+    for axis in 0..3 {
+        sort_along(primitives, axis);
+        let mut above = vec![0.0; count];
+        let mut bounds = Bounds::EMPTY;
+        for index in (1..count).rev() {
+            bounds = bounds.joined(&primitives[index].shape.bounds());
+            above[index] = bounds.surface() * (count - index) as f64;
+        }
+        let mut bounds = Bounds::EMPTY;
+        for middle in 1..=count - least {
+            bounds = bounds.joined(&primitives[middle - 1].shape.bounds());
+            let cost = bounds.surface() * middle as f64 + above[middle];
+            if middle >= least && cost < best.0 {
+                best = (cost, axis, middle);
+            }
+        }
+    }
+    (best.1, best.2)
 }
 
 #[inline]
