@@ -107,19 +107,23 @@ struct Node {
     hides_sky: bool,
 }
 
+type Boxed = (Bounds, Primitive);
+
 const LEAF: usize = 2;
 
 impl Scene {
-    pub fn new(mut primitives: Vec<Primitive>) -> Self {
-        let mut nodes = Vec::with_capacity(primitives.len() * 2);
-        if !primitives.is_empty() {
-            build(&mut primitives, 0, &mut nodes);
+    pub fn new(primitives: Vec<Primitive>) -> Self {
+        let mut boxed: Vec<Boxed> = primitives
+            .into_iter()
+            .map(|primitive| (primitive.shape.bounds(), primitive))
+            .collect();
+        let mut nodes = Vec::with_capacity(boxed.len() * 2);
+        if !boxed.is_empty() {
+            build(&mut boxed, 0, &mut nodes);
         }
+        let (bounds, primitives): (_, Vec<_>) = boxed.into_iter().unzip();
         Self {
-            bounds: primitives
-                .iter()
-                .map(|primitive| primitive.shape.bounds())
-                .collect(),
+            bounds,
             hides: primitives
                 .iter()
                 .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
@@ -230,10 +234,10 @@ impl Scene {
 }
 
 /// A part has at least an eighth of the whole: with 64 open branches there is room for ten thousand primitives.
-fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
-    let bounds = primitives.iter().fold(Bounds::EMPTY, |bounds, primitive| {
-        bounds.joined(&primitive.shape.bounds())
-    });
+fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
+    let bounds = primitives
+        .iter()
+        .fold(Bounds::EMPTY, |bounds, (own, _)| bounds.joined(own));
     let index = nodes.len();
     nodes.push(Node {
         bounds,
@@ -242,10 +246,10 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
         axis: 0,
         hides_lamp: primitives
             .iter()
-            .any(|primitive| primitive.hides(Light::Lamp)),
+            .any(|(_, primitive)| primitive.hides(Light::Lamp)),
         hides_sky: primitives
             .iter()
-            .any(|primitive| primitive.hides(Light::Sky)),
+            .any(|(_, primitive)| primitive.hides(Light::Sky)),
     });
     if primitives.len() <= LEAF {
         return;
@@ -260,16 +264,15 @@ fn build(primitives: &mut [Primitive], offset: u32, nodes: &mut Vec<Node>) {
     build(right, offset + middle as u32, nodes);
 }
 
-fn sort_along(primitives: &mut [Primitive], axis: usize) {
-    primitives.sort_by(|a, b| {
-        let center = |primitive: &Primitive| primitive.shape.bounds().center()[axis];
-        center(a).total_cmp(&center(b))
-    });
+fn sort_along(primitives: &mut [Boxed], axis: usize) {
+    // Twice the centre.
+    let place = |(bounds, _): &Boxed| bounds.min[axis] + bounds.max[axis];
+    primitives.sort_by(|a, b| place(a).total_cmp(&place(b)));
 }
 
 /// The axis and the number of primitives on its lower side for which a ray is expected to meet the fewest: a part is
 /// entered in proportion to its surface.
-fn best_split(primitives: &mut [Primitive]) -> (usize, usize) {
+fn best_split(primitives: &mut [Boxed]) -> (usize, usize) {
     let count = primitives.len();
     let least = (count / 8).max(1);
     let mut best = (f64::INFINITY, 0, count / 2);
@@ -278,12 +281,12 @@ fn best_split(primitives: &mut [Primitive]) -> (usize, usize) {
         let mut above = vec![0.0; count];
         let mut bounds = Bounds::EMPTY;
         for index in (1..count).rev() {
-            bounds = bounds.joined(&primitives[index].shape.bounds());
+            bounds = bounds.joined(&primitives[index].0);
             above[index] = bounds.surface() * (count - index) as f64;
         }
         let mut bounds = Bounds::EMPTY;
         for middle in 1..=count - least {
-            bounds = bounds.joined(&primitives[middle - 1].shape.bounds());
+            bounds = bounds.joined(&primitives[middle - 1].0);
             let cost = bounds.surface() * middle as f64 + above[middle];
             if middle >= least && cost < best.0 {
                 best = (cost, axis, middle);
