@@ -12,7 +12,7 @@ use super::{
     sensor::Sensor,
     story::{Item, Moment, PERSON, Story, furnishings},
     texture::Rgb,
-    tracer::{Lighting, Rendering, Tracer, depth_alone},
+    tracer::{Lighting, LitView, Rendering, Tracer, depth_alone},
     tracker::{Marker, TRACKER_HZ, Tracker},
 };
 use crate::{
@@ -317,14 +317,14 @@ impl Script {
             + self.sensor.exposure_drift
                 * wander(self.seed, 0xe0 + station as u64, frame as f64 / 40.0);
         let key = |camera: u64| [station as u64, frame, camera];
-        let shot = |middle_from_camera: Option<&Pose>, camera: u64| {
+        let shot = |middle_from_camera: Option<&Pose>, camera: u64, beside: Option<&LitView>| {
             let pose_at = |frame: f64| {
                 let world_from_middle = self.world_from_camera(station, frame);
                 middle_from_camera.map_or(world_from_middle, |offset| world_from_middle * offset)
             };
             let intrinsics = &at.rig.intrinsics;
             let pose = pose_at(frame as f64);
-            let rendering = tracer.render(intrinsics, &pose);
+            let (rendering, view) = tracer.render_beside(intrinsics, &pose, beside);
             let blurred = self.blurred(&tracer, intrinsics, &rendering, frame as f64, pose_at);
             let image = self.sensor.expose(
                 blurred.as_ref().unwrap_or(&rendering.radiance),
@@ -343,15 +343,18 @@ impl Script {
                     self.mask(item, stands, intrinsics, &pose, &rendering)
                 })
                 .collect();
-            Shot {
+            let shot = Shot {
                 image,
                 depth_m: rendering.depth_m,
                 depth_through_glass_m: rendering.depth_through_glass_m,
                 object: rendering.object,
                 masks,
-            }
+            };
+            (shot, view)
         };
-        let middle = shot(None, 0);
+        let (middle, view) = shot(None, 0, None);
+        let side =
+            |middle_from_side: &Pose, camera| shot(Some(middle_from_side), camera, Some(&view)).0;
         Capture {
             stamp_ns: self.stamp_ns(frame),
             sequence: frame,
@@ -361,8 +364,8 @@ impl Script {
             middle,
             sides: (views == Views::Triple).then(|| {
                 (
-                    shot(Some(&at.rig.middle_from_left), 1),
-                    shot(Some(&at.rig.middle_from_right), 2),
+                    side(&at.rig.middle_from_left, 1),
+                    side(&at.rig.middle_from_right, 2),
                 )
             }),
             markers: self.observe(station, frame as f64),
