@@ -53,7 +53,7 @@ def test_a_forgotten_corner_is_unknown(session, place, settled):
 
 def test_the_command_line_forgets_a_place(daemon, place, settled):
     reply = told(daemon, "forget", "--place", place, "--everything")
-    assert int(reply["viewpointsRemoved"]) > 0 and "viewpointsLeft" not in reply
+    assert int(reply["viewpoints_removed"]) > 0 and int(reply["viewpoints_left"]) == 0
     assert settled.show().coverage == 0
     assert query(daemon, "forget", "--place", place).returncode == 1
 
