@@ -1,7 +1,7 @@
 //! Every setting of the science and the service: unit, default, bound, reason. A preset gives all of them; a file and
 //! `--set name=value` change single ones; the whole is validated before anything opens.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, net::SocketAddr};
 
 use serde::{Deserialize, Serialize};
 
@@ -391,6 +391,14 @@ pub enum ConfigError {
     Root(String),
     #[error("Zenoh: {0}")]
     Zenoh(String),
+    #[error(
+        "--http {0} can be reached from elsewhere: give --http-token-file FILE, listen on 127.0.0.1 behind a proxy, or say --http-no-token to let everybody in"
+    )]
+    NoToken(SocketAddr),
+    #[error(
+        "--http-token-file {0}: a token is one line of 16 to 1024 visible ASCII characters without spaces, such as `openssl rand -hex 32` makes"
+    )]
+    Token(String),
     #[error("--set {0}: write it as name=value")]
     Pair(String),
     #[error(

@@ -17,6 +17,7 @@ use crate::{
     model::{
         belief::Record,
         camera::Intrinsics,
+        event::Event,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
         mode::Mode,
         pose::Pose,
@@ -26,6 +27,7 @@ use crate::{
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
         depth::{InverseDepthRange, SidesDepth, given},
+        events::{Events, Look},
         interpolate::{
             merge::VIEWS_MAX,
             prior::{self, Prior},
@@ -61,6 +63,23 @@ pub struct PriorAt {
     pub viewpoints_used: Vec<u64>,
 }
 
+/// A part of a frame's way. A pipeline has no clock: it says when a part has ended, and who has a clock may time it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Stage {
+    /// Given and checked, or computed.
+    Depth,
+    Refine,
+    /// Interpolation and surprise.
+    Compare,
+    /// Regions and events.
+    Attend,
+    /// The frame becomes a viewpoint.
+    Remember,
+}
+
+/// Called when a stage has ended.
+type Ended<'a> = &'a mut dyn FnMut(Stage);
+
 /// What a place knows about one camera.
 #[derive(Debug, Clone, Default)]
 struct Camera {
@@ -93,6 +112,7 @@ pub struct Pipeline {
     update_rules: UpdateRules,
     memory: Memory,
     cameras: HashMap<Source, Camera>,
+    events: Events,
     last_region_id: u64,
     /// What the last frame's report needed.
     maps: Maps,
@@ -129,6 +149,7 @@ impl Pipeline {
             update_rules: UpdateRules::new(&settings),
             memory: Memory::default(),
             cameras: HashMap::new(),
+            events: Events::default(),
             last_region_id: 0,
             maps: Maps::default(),
             maps_read: true,
@@ -185,27 +206,43 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process_in(&mut self, mode: Mode, frame: &Frame) -> Result<Report, FrameError> {
+        self.process_staged(mode, frame, &mut |_| {})
+    }
+
+    /// The same, telling `ended` of every stage.
+    ///
+    /// # Errors
+    /// A frame that cannot be used; nothing has changed then.
+    pub fn process_staged(
+        &mut self,
+        mode: Mode,
+        frame: &Frame,
+        ended: Ended,
+    ) -> Result<Report, FrameError> {
         self.depth(frame)?;
+        ended(Stage::Depth);
         let mut camera = match self.cameras.get_mut(&frame.source) {
             Some(camera) => std::mem::take(camera),
             None => Camera::default(),
         };
         let before = (mode == Mode::Freeze).then(|| camera.visit.clone());
         let learn = mode == Mode::Learn;
-        let looked = self
-            .look(frame, &mut camera.visit, learn)
-            .map(|mut report| {
-                if learn {
-                    let id = self.remember(frame, &report.world_from_camera);
-                    camera.visit.wrote(id);
-                    report.viewpoint_id = Some(id);
-                }
-                camera
-                    .follower
-                    .follow(&mut report.regions, &mut self.last_region_id);
-                report.learned = learn;
-                report
-            });
+        let looked = self.look(frame, &mut camera.visit, learn, ended);
+        let looked = looked.map(|mut report| {
+            camera
+                .follower
+                .follow(&mut report.regions, &mut self.last_region_id);
+            report.events = self.follow_events(frame, &mut report);
+            ended(Stage::Attend);
+            if learn {
+                let id = self.remember(frame, &report.world_from_camera);
+                camera.visit.wrote(id);
+                report.viewpoint_id = Some(id);
+                ended(Stage::Remember);
+            }
+            report.learned = learn;
+            report
+        });
         if let Some(before) = before {
             camera.visit = before;
         }
@@ -216,6 +253,28 @@ impl Pipeline {
             }
         }
         looked
+    }
+
+    /// What the frame that was looked at says about the place's events, before its depth becomes a viewpoint's.
+    fn follow_events(&mut self, frame: &Frame, report: &mut Report) -> Vec<Event> {
+        let mut events = std::mem::take(&mut self.events);
+        let look = Look {
+            source: &frame.source,
+            stamp_ns: frame.stamp_ns,
+            sequence: frame.sequence,
+            image: &frame.image,
+            scene: Scene {
+                depth_m: &self.workspace.depth_m,
+                intrinsics: &frame.intrinsics,
+                world_from_camera: &report.world_from_camera,
+            },
+            evidence: &self.maps.evidence,
+            unseen_share: 1.0 - report.coverage,
+            prior: &|| &self.maps().prior,
+        };
+        let changed = events.observe(&look, &mut report.regions, &self.settings);
+        self.events = events;
+        changed
     }
 
     /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
@@ -269,7 +328,7 @@ impl Pipeline {
         let mut visit = camera
             .map(|camera| camera.visit.clone())
             .unwrap_or_default();
-        self.look(frame, &mut visit, false)
+        self.look(frame, &mut visit, false, &mut |_| {})
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
@@ -313,6 +372,7 @@ impl Pipeline {
         frame: &Frame,
         visit: &mut Visit,
         learn: bool,
+        ended: Ended,
     ) -> Result<Report, FrameError> {
         let mut work = std::mem::take(&mut self.workspace);
         let mut maps = std::mem::take(&mut self.maps);
@@ -320,6 +380,7 @@ impl Pipeline {
 
         let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
         let world_from_camera = refined.world_from_camera;
+        ended(Stage::Refine);
 
         self.select(&world_from_camera, &mut work.selected);
         let used = self.ids(&work.selected);
@@ -343,6 +404,7 @@ impl Pipeline {
             .engine
             .compare(&question, self.settings.evidence, learn, answer);
         self.whole_maps.take();
+        ended(Stage::Compare);
         let compared = match compared {
             Ok(compared) => compared,
             Err(error) => {
@@ -378,6 +440,7 @@ impl Pipeline {
             max_surprise: max,
             mean_surprise: (sum / count.max(1) as f64) as f32,
             coverage: compared.seen as f32 / frame.intrinsics.pixels() as f32,
+            events: Vec::new(),
             learned: false,
             viewpoint_id: None,
             viewpoints_used: used,

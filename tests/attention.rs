@@ -202,6 +202,7 @@ fn region_at(x_m: f64) -> Region {
         area: 400,
         center_in_world: Some(nalgebra::Point3::new(x_m, 0.0, 1.0)),
         touches_border: false,
+        event_id: 0,
     }
 }
 

@@ -88,6 +88,33 @@ fn every_list_names_every_frame_and_every_file_is_there() {
 }
 
 #[test]
+fn the_shade_of_the_cup_is_ignored_and_the_cup_is_not() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let script = Script::tabletop(1);
+    recording(dir, &script, &some(Truth::Exact)).unwrap();
+    let ignored = image::open(dir.join("ignore/1096.571429.png")).unwrap();
+    let ignored = ignored.as_luma8().expect("8 bit").as_raw();
+    let capture = script.capture(0, 676, Views::Middle);
+    for mask in &capture.middle.masks {
+        assert!(
+            mask.iter()
+                .zip(ignored)
+                .all(|(item, ignored)| item & ignored == 0)
+        );
+    }
+    // Where the cloth is darker than in the same picture without the cup.
+    let cup = &capture.middle.masks[1];
+    let low = (0..cup.len())
+        .rfind(|&pixel| cup[pixel] == 255)
+        .expect("it is in view");
+    let shaded = (0..2).any(|below| ignored[low + below * capture.middle.image.width] == 255);
+    assert!(shaded, "below the cup's foot lies its shade");
+    let share = ignored.iter().filter(|&&value| value == 255).count() as f64 / ignored.len() as f64;
+    assert!((0.002..0.2).contains(&share), "{share} of the image");
+}
+
+#[test]
 fn measured_poses_are_near_the_truth_and_measured_depth_sees_through_glass() {
     let dir = tempfile::tempdir().unwrap();
     let dir = dir.path();

@@ -52,7 +52,7 @@ impl Demo {
             .context("the service listens nowhere: give it --listen tcp/127.0.0.1:0")?
             .clone();
         match service.http_addr() {
-            Some(addr) => println!("http://{addr}/api/v1/places/{PLACE} - Ctrl-C ends it"),
+            Some(addr) => println!("The page is at http://{addr}/ - Ctrl-C ends it"),
             None => println!("no HTTP - Ctrl-C ends it"),
         }
         println!("The robots get to know the table first; then things come and go.");

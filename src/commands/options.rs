@@ -5,7 +5,11 @@ use std::{net::SocketAddr, path::PathBuf};
 use crate::{
     config::{ConfigError, Preset, Settings},
     engine::EngineKind,
-    service::{self, session::ZenohOptions},
+    service::{
+        self,
+        access::{HttpAccess, Token},
+        session::ZenohOptions,
+    },
 };
 
 /// The science's and the service's settings.
@@ -51,6 +55,12 @@ pub struct ServiceOptions {
     /// Address to serve HTTP on; off for none.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", value_parser = http)]
     pub http: Http,
+    /// File with the token that requests over HTTP must carry; needed where --http is not on loopback.
+    #[arg(long, value_name = "FILE")]
+    pub http_token_file: Option<PathBuf>,
+    /// Let everybody in who can reach the HTTP address.
+    #[arg(long, conflicts_with = "http_token_file")]
+    pub http_no_token: bool,
     /// The Zenoh key below which everything is.
     #[arg(long, value_name = "KEY", default_value = "surprised")]
     pub root: String,
@@ -60,13 +70,21 @@ pub struct ServiceOptions {
 
 impl ServiceOptions {
     /// # Errors
-    /// Settings that are wrong.
+    /// Settings that are wrong, or a token that cannot be used.
     pub fn options(self) -> Result<service::Options, ConfigError> {
         Ok(service::Options {
             settings: self.settings.settings()?,
             engine: self.engine,
             root: self.root,
             http: self.http.0,
+            http_access: HttpAccess {
+                token: self
+                    .http_token_file
+                    .as_deref()
+                    .map(Token::read)
+                    .transpose()?,
+                open: self.http_no_token,
+            },
             zenoh: self.zenoh,
         })
     }

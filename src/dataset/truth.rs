@@ -1,8 +1,9 @@
 //! What is known about a recording: the phases of its experiment, where objects are, which way the camera went.
 //!
 //! `phases.csv`: time, phase, pass, objects present (`a+b`), object evaluated. `mask/<object>/<t>.png`: over 127 inside
-//! the silhouette, also where an absent object would stand. `passes.csv`: time, pass. `boxes.json`, beside runs: per
-//! run and viewpoint what differs from the first run.
+//! the silhouette, also where an absent object would stand. `ignore/<t>.png`: over 127 where nothing is judged, as an
+//! object's shade or a passer-by. `passes.csv`: time, pass. `boxes.json`, beside runs: per run and viewpoint what differs
+//! from the first run.
 
 use std::{
     collections::HashMap,
@@ -24,6 +25,8 @@ pub struct Truth {
     pub moments: Vec<Moment>,
     /// Masks by object, one for each entry of the recording, `None` where the object is out of view.
     masks: HashMap<String, Vec<Option<PathBuf>>>,
+    /// Where nothing is judged: one for each entry, `None` where everything is, or none at all.
+    ignored: Vec<Option<PathBuf>>,
     /// One list for each entry, or none at all.
     pub boxes: Vec<Vec<TruthBox>>,
 }
@@ -100,6 +103,7 @@ impl Truth {
         Ok(Self {
             moments,
             masks: masks(&folder.join("mask"), entries)?,
+            ignored: of_entries(&folder.join("ignore"), entries),
             boxes: Vec::new(),
         })
     }
@@ -124,24 +128,55 @@ impl Truth {
         let Some(Some(path)) = self.masks.get(object).and_then(|paths| paths.get(index)) else {
             return Ok(None);
         };
-        let mask = image::open(path)
-            .map_err(|source| decode_error(path, source))?
-            .into_luma8();
-        if mask.dimensions() != (width as u32, height as u32) {
-            return Err(DatasetError::Content {
-                path: path.clone(),
-                got: format!("{}x{} pixels", mask.width(), mask.height()),
-                expected: format!("{width}x{height} as the images"),
-                hint: "draw masks on the images themselves",
-            });
-        }
-        let inside: Vec<bool> = mask
-            .into_raw()
-            .into_iter()
-            .map(|value| value > 127)
-            .collect();
+        let inside = read_mask(path, (width, height))?;
         Ok(inside.contains(&true).then_some(inside))
     }
+
+    /// Where nothing is judged, a value a pixel; `None` if everything is.
+    ///
+    /// # Errors
+    /// As [`Self::mask`].
+    pub fn ignored(
+        &self,
+        index: usize,
+        size: (usize, usize),
+    ) -> Result<Option<Vec<bool>>, DatasetError> {
+        match self.ignored.get(index) {
+            Some(Some(path)) => read_mask(path, size).map(Some),
+            _ => Ok(None),
+        }
+    }
+}
+
+fn read_mask(path: &Path, (width, height): (usize, usize)) -> Result<Vec<bool>, DatasetError> {
+    let mask = image::open(path)
+        .map_err(|source| decode_error(path, source))?
+        .into_luma8();
+    if mask.dimensions() != (width as u32, height as u32) {
+        return Err(DatasetError::Content {
+            path: path.to_owned(),
+            got: format!("{}x{} pixels", mask.width(), mask.height()),
+            expected: format!("{width}x{height} as the images"),
+            hint: "draw masks on the images themselves",
+        });
+    }
+    Ok(mask
+        .into_raw()
+        .into_iter()
+        .map(|value| value > 127)
+        .collect())
+}
+
+/// The pictures of a folder that have the names of the images they belong to, one for each entry.
+fn of_entries(folder: &Path, entries: &[Entry]) -> Vec<Option<PathBuf>> {
+    entries
+        .iter()
+        .map(|entry| {
+            let name = entry.image.file_stem()?;
+            let path = folder.join(name).with_added_extension("png");
+            path.is_file().then_some(path)
+        })
+        .collect()
 }
 
 /// One for each entry, found by its stamp.
@@ -231,15 +266,7 @@ fn masks(
     };
     for object in std::fs::read_dir(folder).map_err(read_error)? {
         let object = object.map_err(read_error)?;
-        // Masks have the names of the images they belong to.
-        let paths = entries
-            .iter()
-            .map(|entry| {
-                let name = entry.image.file_stem()?;
-                let path = object.path().join(name).with_added_extension("png");
-                path.is_file().then_some(path)
-            })
-            .collect();
+        let paths = of_entries(&object.path(), entries);
         masks.insert(object.file_name().to_string_lossy().into_owned(), paths);
     }
     Ok(masks)

@@ -198,6 +198,14 @@ impl Engine {
         }
     }
 
+    /// What was moved and done; `None` where nothing is moved.
+    pub fn counters(&self) -> Option<&gpu::Counters> {
+        match self {
+            Self::Cpu(_) => None,
+            Self::Gpu(gpu) => Some(gpu.counters()),
+        }
+    }
+
     /// Says that viewpoints were changed or removed without a frame.
     pub fn forget(&mut self) {
         if let Self::Gpu(gpu) = self {

@@ -159,12 +159,24 @@ pub fn measure(
                     && (&last.moment.phase, &last.moment.pass) == (&moment.phase, &moment.pass);
                 last.group + usize::from(!same)
             });
-            let ignored = ignored_pixels(&frame, &conditions.ignored);
+            let mut ignored = ignored_pixels(&frame, &conditions.ignored);
+            let Intrinsics { width, height, .. } = frame.intrinsics;
+            if let Some(marked) = recording.truth.ignored(index, (width, height))? {
+                ignored
+                    .iter_mut()
+                    .zip(marked)
+                    .for_each(|(all, one)| *all |= one);
+            }
             let (largest, largest_outside) =
                 largest_blocks(recording, index, &frame, &verdict, &ignored, settings)?;
-            let (object, sides) = object_score(
-                recording, index, &frame, method, &verdict, settings, &moment,
-            )?;
+            let mask = match &moment.evaluated {
+                Some(object) => recording.truth.mask(object, index, (width, height))?,
+                None => None,
+            };
+            let (object, sides) = mask.map_or_else(
+                || (None, Sides::default()),
+                |mask| object_score(&mask, &ignored, &frame, method, &verdict, settings),
+            );
             let boxes = recording.truth.boxes.get(index).map(|boxes| {
                 let before = previous.and_then(|run| run.truth.boxes.get(index));
                 box_score(
@@ -203,30 +215,23 @@ pub fn measure(
 }
 
 fn object_score(
-    recording: &Recording,
-    index: usize,
+    mask: &[bool],
+    ignored: &[bool],
     frame: &Frame,
     method: &Method,
     verdict: &Verdict,
     settings: &Settings,
-    moment: &Moment,
-) -> Result<(Option<ObjectScore>, Sides), DatasetError> {
-    let Intrinsics { width, height, .. } = frame.intrinsics;
-    let Some(object) = &moment.evaluated else {
-        return Ok((None, Sides::default()));
-    };
-    let Some(mask) = recording.truth.mask(object, index, (width, height))? else {
-        return Ok((None, Sides::default()));
-    };
-    let sides = Sides::new(&verdict.evidence, &mask, width, settings.border_px);
+) -> (Option<ObjectScore>, Sides) {
+    let width = frame.intrinsics.width;
+    let sides = Sides::new(&verdict.evidence, mask, ignored, width, settings.border_px);
     let (Some(auc), Some(precision)) = (
         roc_auc(&sides.inside, &sides.outside),
         average_precision(&sides.inside, &sides.outside),
     ) else {
         // In the border strip.
-        return Ok((None, Sides::default()));
+        return (None, Sides::default());
     };
-    let iou = mask_box(&mask, width)
+    let iou = mask_box(mask, width)
         .zip(verdict.best_box(frame, settings))
         .map_or(0.0, |(truth, found)| truth.iou(&found));
     let score = ObjectScore {
@@ -238,9 +243,9 @@ fn object_score(
         auc,
         average_precision: precision,
         iou,
-        error_grey: method.error_in(frame, verdict.gain, &mask),
+        error_grey: method.error_in(frame, verdict.gain, mask),
     };
-    Ok((Some(score), sides))
+    (Some(score), sides)
 }
 
 /// Of all blocks, and of those outside every object's mask.
@@ -253,7 +258,7 @@ fn largest_blocks(
     settings: &Settings,
 ) -> Result<(f64, f64), DatasetError> {
     let Intrinsics { width, height, .. } = frame.intrinsics;
-    let mut masked = ignored.to_vec();
+    let mut masked = vec![false; width * height];
     for object in recording.truth.objects() {
         if let Some(mask) = recording.truth.mask(object, index, (width, height))? {
             masked
@@ -263,7 +268,7 @@ fn largest_blocks(
         }
     }
     let largest = |mask: &[bool]| {
-        Sides::new(&verdict.evidence, mask, width, settings.border_px).max_outside()
+        Sides::new(&verdict.evidence, mask, ignored, width, settings.border_px).max_outside()
     };
     Ok((largest(ignored), largest(&masked)))
 }

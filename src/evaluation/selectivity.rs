@@ -1,8 +1,8 @@
 //! Attentional selectivity AS (24) and its peak PAS (25) of a block map against a mask.
 //!
 //! Mean and maximum inside over the maximum outside, in dB. The strip along the border is left out. A block is inside
-//! if at least half of it is in the mask; outside if no mask comes within one block of it; what lies between counts
-//! nowhere.
+//! if at least half of it is in the mask; outside if neither the mask nor what is ignored comes within one block of it;
+//! what lies between counts nowhere.
 
 use crate::{
     model::report::PixelBox,
@@ -30,12 +30,20 @@ pub struct Sides {
 }
 
 impl Sides {
-    /// `mask` holds a value a pixel, in rows of `width`.
-    pub fn new(blocks: &BlockMap, mask: &[bool], width: usize, border_px: usize) -> Self {
+    /// `mask` and `ignored` hold a value a pixel, in rows of `width`.
+    pub fn new(
+        blocks: &BlockMap,
+        mask: &[bool],
+        ignored: &[bool],
+        width: usize,
+        border_px: usize,
+    ) -> Self {
         let covered = covered_pixels(blocks, mask, width);
+        let either: Vec<bool> = mask.iter().zip(ignored).map(|(a, b)| a | b).collect();
+        let unjudged = covered_pixels(blocks, &either, width);
         let near = |x: usize, y: usize| {
             (y.saturating_sub(1)..(y + 2).min(blocks.height)).any(|y| {
-                let row = &covered[y * blocks.width..][..blocks.width];
+                let row = &unjudged[y * blocks.width..][..blocks.width];
                 row[x.saturating_sub(1)..(x + 2).min(blocks.width)]
                     .iter()
                     .any(|&pixels| pixels > 0)

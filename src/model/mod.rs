@@ -14,4 +14,6 @@ pub mod refusal;
 
 pub mod report;
 
+pub mod event;
+
 pub mod viewpoint;

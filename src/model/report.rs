@@ -2,7 +2,7 @@
 
 use nalgebra::Point3;
 
-use super::{frame::Source, pose::Pose};
+use super::{event::Event, frame::Source, pose::Pose};
 
 /// Half-open: `x_min <= x < x_max`, pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,6 +54,8 @@ pub struct Region {
     /// Metres; `None` where the region has no depth.
     pub center_in_world: Option<Point3<f64>>,
     pub touches_border: bool,
+    /// The event that it belongs to; 0 = none yet.
+    pub event_id: u64,
 }
 
 /// One for every processed frame.
@@ -72,6 +74,8 @@ pub struct Report {
     pub mean_surprise: f32,
     /// Share of the pixels that some viewpoint saw, 0..1.
     pub coverage: f32,
+    /// What has changed about the place's events with this frame.
+    pub events: Vec<Event>,
     pub learned: bool,
     /// The viewpoint that the frame became; `None` if it was not learnt.
     pub viewpoint_id: Option<u64>,

@@ -102,6 +102,7 @@ pub struct Evaluated {
 /// What a camera saw last and what was thought of it, for people to look at.
 #[derive(Debug)]
 pub struct Snapshot {
+    pub report: Arc<proto::SurpriseReport>,
     pub frame: Arc<RgbImage>,
     pub expected: RgbImage,
     /// Nats a pixel.

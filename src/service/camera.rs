@@ -126,7 +126,8 @@ pub struct Waiting {
     reason = "one is made and taken apart a frame"
 )]
 pub enum Turn {
-    Ready(Pose, PackedFrame),
+    /// With when it came.
+    Ready(Pose, PackedFrame, Instant),
     /// Look again then, or when something has come.
     Until(Instant),
     Refused(Refused),
@@ -327,8 +328,8 @@ impl Camera {
                 };
                 match pose {
                     TrackedPose::At(pose) => {
-                        let frame = self.waiting.take()?.frame;
-                        return Some(Turn::Ready(pose, frame));
+                        let Waiting { frame, arrived } = self.waiting.take()?;
+                        return Some(Turn::Ready(pose, frame, arrived));
                     }
                     TrackedPose::Never(refusal) => refuse(refusal),
                     TrackedPose::Later => {
@@ -364,6 +365,7 @@ impl Camera {
         report: proto::SurpriseReport,
         stamp_ns: i64,
     ) {
+        self.status.intrinsics = Some(lenses.calibration.middle.intrinsics);
         self.calibration = Some(lenses);
         self.last_pose = Some(world_from_camera);
         self.order.accept(stamp_ns);
@@ -386,11 +388,11 @@ impl Camera {
         &mut self,
         answer: Answer<Arc<Snapshot>>,
         now: Instant,
-        make: Option<impl FnOnce(Arc<RgbImage>) -> Snapshot>,
+        make: Option<impl FnOnce(Arc<RgbImage>, Arc<proto::SurpriseReport>) -> Snapshot>,
     ) {
         self.watched_until = Some(now + WATCHED);
-        if let (None, Some(make), Some(image)) = (&self.snapshot, make, &self.last_image) {
-            self.snapshot = Some(Arc::new(make(image.clone())));
+        if let (None, Some(make)) = (&self.snapshot, make) {
+            self.snapshot = self.snapshot_by(make);
         }
         self.watchers.retain(|watcher| !watcher.is_closed());
         match &self.snapshot {
@@ -406,11 +408,21 @@ impl Camera {
         self.watched_until.is_some_and(|until| now < until)
     }
 
-    pub fn show(&mut self, make: impl FnOnce(Arc<RgbImage>) -> Snapshot) {
-        let Some(image) = &self.last_image else {
+    fn snapshot_by(
+        &self,
+        make: impl FnOnce(Arc<RgbImage>, Arc<proto::SurpriseReport>) -> Snapshot,
+    ) -> Option<Arc<Snapshot>> {
+        let (image, report) = (self.last_image.clone()?, self.status.report.clone()?);
+        Some(Arc::new(make(image, report)))
+    }
+
+    pub fn show(
+        &mut self,
+        make: impl FnOnce(Arc<RgbImage>, Arc<proto::SurpriseReport>) -> Snapshot,
+    ) {
+        let Some(snapshot) = self.snapshot_by(make) else {
             return;
         };
-        let snapshot = Arc::new(make(image.clone()));
         for watcher in self.watchers.drain(..) {
             // Whoever asked may have gone.
             drop(watcher.send(Ok(snapshot.clone())));

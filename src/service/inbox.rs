@@ -54,13 +54,34 @@ pub enum Aside {
 }
 
 /// Counted on the way in.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
 pub struct SlotCounters {
     /// Frames that a newer one replaced before the worker was free.
     pub frames_replaced: u64,
     pub poses_dropped: u64,
     /// Refusals too many to be published.
     pub refusals_dropped: u64,
+}
+
+/// Of all cameras of a place, also those that made room for others.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
+pub struct InboxCounters {
+    pub frames_received: u64,
+    /// Of frames.
+    pub bytes_received: u64,
+    /// Frames that a newer one replaced before the worker was free.
+    pub frames_replaced: u64,
+    pub poses_dropped: u64,
+    /// Asks refused because the queue was full.
+    pub asks_busy: u64,
+}
+
+/// What waits in an inbox.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Depths {
+    pub frames: usize,
+    pub poses: usize,
+    pub asks: usize,
 }
 
 #[derive(Debug)]
@@ -85,7 +106,7 @@ struct State {
     asks: VecDeque<Ask>,
     /// One was taken and may come back.
     ask_under_way: bool,
-    asks_busy: u64,
+    counters: InboxCounters,
     /// A camera came or went.
     live_changed: bool,
     closed: bool,
@@ -120,10 +141,15 @@ impl Inbox {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn with_slot(&self, source: &Source, put: impl FnOnce(&mut Slot)) -> Result<(), Refusal> {
+    fn with_slot(
+        &self,
+        source: &Source,
+        put: impl FnOnce(&mut Slot, &mut InboxCounters),
+    ) -> Result<(), Refusal> {
         let mut state = self.lock();
+        let state = &mut *state;
         if !state.cameras.contains_key(source) {
-            make_room(&mut state)?;
+            make_room(state)?;
         }
         let slot = state.cameras.entry(source.clone()).or_insert_with(|| Slot {
             frame: None,
@@ -138,8 +164,7 @@ impl Inbox {
             counters: SlotCounters::default(),
         });
         slot.heard = Instant::now();
-        put(slot);
-        drop(state);
+        put(slot, &mut state.counters);
         self.wake.notify_one();
         Ok(())
     }
@@ -147,10 +172,13 @@ impl Inbox {
     /// # Errors
     /// `too_many_cameras`, as everything that is put for a camera.
     pub fn put_frame(&self, source: &Source, arrival: Arrival) -> Result<(), Refusal> {
-        self.with_slot(source, |slot| {
+        self.with_slot(source, |slot, place| {
+            place.frames_received += 1;
+            place.bytes_received += arrival.payload.len() as u64;
             if slot.frame.replace(arrival).is_some() {
                 slot.replaced_since_taken += 1;
                 slot.counters.frames_replaced += 1;
+                place.frames_replaced += 1;
             }
         })
     }
@@ -158,11 +186,12 @@ impl Inbox {
     /// # Errors
     /// `too_many_cameras`.
     pub fn put_aside(&self, source: &Source, aside: Aside) -> Result<(), Refusal> {
-        self.with_slot(source, |slot| match aside {
+        self.with_slot(source, |slot, place| match aside {
             Aside::Pose(_) | Aside::Markers(_) => {
                 if slot.poses.len() == POSES_MAX {
                     slot.poses.pop_front();
                     slot.counters.poses_dropped += 1;
+                    place.poses_dropped += 1;
                 }
                 slot.poses.push_back(aside);
             }
@@ -181,7 +210,7 @@ impl Inbox {
     /// # Errors
     /// `too_many_cameras`.
     pub fn set_live(&self, source: &Source, live: bool) -> Result<(), Refusal> {
-        self.with_slot(source, |slot| slot.live = live)?;
+        self.with_slot(source, |slot, _| slot.live = live)?;
         self.lock().live_changed = true;
         self.wake.notify_one();
         Ok(())
@@ -193,7 +222,7 @@ impl Inbox {
         let mut state = self.lock();
         let asks = state.asks.len() + usize::from(state.ask_under_way);
         if state.closed || asks >= ASKS_MAX {
-            state.asks_busy += 1;
+            state.counters.asks_busy += 1;
             return Err(NotAsked);
         }
         state.asks.push_back(ask);
@@ -222,7 +251,7 @@ impl Inbox {
     /// # Errors
     /// `too_many_cameras`.
     pub fn open(&self, source: &Source) -> Result<(), Refusal> {
-        self.with_slot(source, |_| ())
+        self.with_slot(source, |_, _| ())
     }
 
     pub fn close(&self) {
@@ -295,9 +324,18 @@ impl Inbox {
             .collect()
     }
 
-    /// Asks refused because the queue was full.
-    pub fn asks_busy(&self) -> u64 {
-        self.lock().asks_busy
+    pub fn counters(&self) -> InboxCounters {
+        self.lock().counters
+    }
+
+    pub fn depths(&self) -> Depths {
+        let state = self.lock();
+        let slots = || state.cameras.values();
+        Depths {
+            frames: slots().filter(|slot| slot.frame.is_some()).count(),
+            poses: slots().map(|slot| slot.poses.len()).sum(),
+            asks: state.asks.len(),
+        }
     }
 }
 
@@ -432,7 +470,7 @@ mod tests {
         drop(inbox.take_ask());
         inbox.end_ask(None);
         inbox.put_ask(ask()).expect("it was answered");
-        assert_eq!(inbox.asks_busy(), 3);
+        assert_eq!(inbox.counters().asks_busy, 3);
     }
 
     #[test]

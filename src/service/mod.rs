@@ -1,5 +1,7 @@
 //! How the service is reached: Zenoh in, Zenoh out, HTTP beside it, and one worker thread a place in between.
 
+pub mod access;
+
 pub mod session;
 
 pub mod client;
@@ -26,6 +28,11 @@ mod turns;
 
 mod status;
 
+mod events;
+
+mod live;
+
+mod metrics;
 mod questions;
 
 mod queries;
@@ -38,8 +45,10 @@ use tokio::{net::TcpListener, sync::mpsc, time::timeout};
 use zenoh::query::Queryable;
 
 use self::{
+    access::HttpAccess,
     http::{Parts, Server},
     ingest::Ingest,
+    live::NEWS_MAX,
     places::Places,
     questions::Questions,
     readiness::Readiness,
@@ -63,6 +72,7 @@ pub struct Options {
     pub root: String,
     /// `None`: no HTTP.
     pub http: Option<SocketAddr>,
+    pub http_access: HttpAccess,
     pub zenoh: ZenohOptions,
 }
 
@@ -91,7 +101,7 @@ pub enum ServeError {
 pub struct Service {
     places: Arc<Places>,
     ingest: Ingest,
-    queryables: [Queryable<()>; 2],
+    queryables: Vec<Queryable<()>>,
     http: Option<Server>,
     readiness: Readiness,
     failures: mpsc::UnboundedReceiver<String>,
@@ -117,11 +127,15 @@ impl Service {
             engine,
             root,
             http,
+            http_access,
             zenoh,
         } = options;
         settings.validate()?;
         if !keys::is_root(&root) {
             return Err(ConfigError::Root(root).into());
+        }
+        if let Some(addr) = http {
+            http_access.check(addr)?;
         }
         let config = zenoh.config(Limits::new(&settings).message_bytes_max())?;
 
@@ -155,11 +169,24 @@ impl Service {
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let (places, starts) = Places::new(settings, engine, root.into(), session, pool, failed);
+        let (news, told) = mpsc::channel(NEWS_MAX);
+        let (places, starts) = Places::new(
+            settings,
+            engine,
+            root.into(),
+            session,
+            pool,
+            failed,
+            http.is_some().then_some(news),
+        );
         let places = Arc::new(places);
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
         let questions = Arc::new(Questions::new(places.clone(), ingest.counters.clone()));
-        let queryables = queries::start(&questions, &ingest.counters).map_err(ServeError::Zenoh)?;
+        let mut queryables: Vec<_> = queries::start(&questions, &ingest.counters)
+            .map_err(ServeError::Zenoh)?
+            .into();
+        let of_events = events::start(&places, ingest.counters.clone());
+        queryables.push(of_events.map_err(ServeError::Zenoh)?);
         drop(workers_latch);
 
         let http = match listener {
@@ -169,9 +196,10 @@ impl Service {
                     places: places.clone(),
                     counters: ingest.counters.clone(),
                     locators: locators.clone(),
+                    live: live::start(&places, told),
                     questions,
                 };
-                let server = http::start(listener, readiness.clone(), parts)
+                let server = http::start(listener, readiness.clone(), http_access, parts)
                     .map_err(|error| ServeError::Http { addr, error })?;
                 tracing::info!("HTTP on http://{}", server.addr);
                 Some(server)

@@ -11,7 +11,15 @@ use rayon::ThreadPool;
 use tokio::sync::{mpsc, watch};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
-use super::{inbox::Inbox, ingest, status::PlaceStatus, worker::Worker};
+use super::{
+    events::PlaceEvents,
+    inbox::Inbox,
+    ingest,
+    live::News,
+    metrics::Metrics,
+    status::{PlaceStatus, PlaceTotals},
+    worker::Worker,
+};
 use crate::{
     config::Settings,
     engine::{Engine, EngineKind},
@@ -29,8 +37,16 @@ pub const PLACES_MAX: usize = 16;
 pub struct Place {
     pub inbox: Arc<Inbox>,
     pub status: watch::Receiver<Arc<PlaceStatus>>,
+    pub events: watch::Receiver<Arc<PlaceEvents>>,
     /// Taken by the worker when it starts.
-    publish_status: Mutex<Option<watch::Sender<Arc<PlaceStatus>>>>,
+    publish: Mutex<Option<Publish>>,
+}
+
+/// Where a worker puts what others may know.
+#[derive(Debug)]
+struct Publish {
+    status: watch::Sender<Arc<PlaceStatus>>,
+    events: watch::Sender<Arc<PlaceEvents>>,
 }
 
 pub struct Places {
@@ -44,6 +60,8 @@ pub struct Places {
     /// Told the name of each place whose worker has panicked or cannot start.
     failures: mpsc::UnboundedSender<String>,
     starts: mpsc::Sender<Arc<str>>,
+    pub metrics: Arc<Metrics>,
+    news: Option<mpsc::Sender<News>>,
 }
 
 struct Running {
@@ -62,6 +80,7 @@ impl Places {
         session: Session,
         pool: Arc<ThreadPool>,
         failures: mpsc::UnboundedSender<String>,
+        news: Option<mpsc::Sender<News>>,
     ) -> (Self, Starts) {
         let (starts, started) = mpsc::channel(PLACES_MAX);
         let places = Self {
@@ -74,6 +93,8 @@ impl Places {
             running: Mutex::default(),
             failures,
             starts,
+            metrics: Arc::default(),
+            news,
         };
         (places, started)
     }
@@ -112,16 +133,24 @@ impl Places {
                 ),
             ));
         }
-        let status = Arc::new(PlaceStatus {
+        let totals = PlaceTotals {
             place: name.to_string(),
             memory_bytes_max: self.settings.memory_bytes,
-            ..PlaceStatus::default()
-        });
-        let (publish_status, status) = watch::channel(status);
+            ..PlaceTotals::default()
+        };
+        let (publish_status, status) = watch::channel(Arc::new(PlaceStatus {
+            totals,
+            cameras: Vec::new(),
+        }));
+        let (publish_events, events) = watch::channel(Arc::default());
         let place = Arc::new(Place {
             inbox: Arc::default(),
             status,
-            publish_status: Mutex::new(Some(publish_status)),
+            events,
+            publish: Mutex::new(Some(Publish {
+                status: publish_status,
+                events: publish_events,
+            })),
         });
         places.insert(name.clone(), place.clone());
         // There is room for every place; the other end is gone only when the service is.
@@ -145,12 +174,12 @@ impl Places {
         let Some(place) = self.get(name) else {
             return Ok(());
         };
-        let status = place
-            .publish_status
+        let publish = place
+            .publish
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .take();
-        let Some(status) = status else {
+        let Some(Publish { status, events }) = publish else {
             return Ok(());
         };
         let token = keys::live_service(&self.root, name, &self.session.zid().to_string());
@@ -165,6 +194,9 @@ impl Places {
             inbox: place.inbox.clone(),
             pipeline,
             status,
+            events,
+            metrics: self.metrics.clone(),
+            news: self.news.clone(),
             ask_calibration: ingest::calibration_getter(
                 self.session.clone(),
                 self.root.clone(),

@@ -13,7 +13,7 @@ use tokio::{
 };
 
 use super::{
-    ask::{Answer, Ask},
+    ask::{Answer, Ask, Snapshot},
     camera::busy,
     ingest::IngestCounters,
     places::{Place, Places},
@@ -92,11 +92,34 @@ impl Questions {
         busy()
     }
 
+    /// Counts what comes of a question.
+    async fn counted<T>(
+        &self,
+        kind: &'static str,
+        answer: impl Future<Output = Result<T, Refusal>>,
+    ) -> Result<T, Refusal> {
+        let answer = answer.await;
+        let outcome = answer
+            .as_ref()
+            .map_or_else(|refusal| refusal.code, |_| "ok");
+        self.places.metrics.query(kind, outcome);
+        answer
+    }
+
+    /// What a camera saw last.
+    ///
+    /// # Errors
+    /// `unknown_camera`, `busy`, `late`.
+    pub async fn picture(&self, place: &Place, camera: Source) -> Result<Arc<Snapshot>, Refusal> {
+        let asked = self.ask(place, |answer| Ask::Snapshot { camera, answer });
+        self.counted("picture", asked).await
+    }
+
     /// Puts an ask and waits for its answer.
     ///
     /// # Errors
     /// `busy`, `late`, or whatever the worker says.
-    pub async fn ask<T>(
+    async fn ask<T>(
         &self,
         place: &Place,
         make: impl FnOnce(Answer<T>) -> Ask,
@@ -126,6 +149,7 @@ impl Questions {
         place: &Place,
         request: &proto::PriorRequest,
     ) -> Result<Held<proto::PriorReply>, Refusal> {
+        self.counted("prior", async {
         let (world_from_camera, intrinsics, planes) =
             questions::prior(request, self.limits.image_pixels_max)?;
         let per_pixel: usize = PriorPlane::ALL
@@ -157,6 +181,7 @@ impl Questions {
             reply,
             room: Some(room),
         })
+        }).await
     }
 
     /// `camera`: whose calibration and visit to use; `name`: the place's. The request's room is the caller's.
@@ -170,27 +195,30 @@ impl Questions {
         request: proto::EvaluateRequest,
         camera: Option<Source>,
     ) -> Result<Held<proto::EvaluateReply>, Refusal> {
-        let frame = request
-            .frame
-            .ok_or_else(|| Refusal::new("no_image", "the request has no frame: fill `frame`"))?;
-        let evaluated = self
-            .ask(place, |answer| Ask::Evaluate {
-                frame: Box::new(frame),
-                camera,
-                answer,
+        self.counted("evaluate", async {
+            let frame = request.frame.ok_or_else(|| {
+                Refusal::new("no_image", "the request has no frame: fill `frame`")
+            })?;
+            let evaluated = self
+                .ask(place, |answer| Ask::Evaluate {
+                    frame: Box::new(frame),
+                    camera,
+                    answer,
+                })
+                .await?;
+            let room = self.room(size_of_val(evaluated.surprise.as_slice()))?;
+            let report = encode::report(&evaluated.report, name, evaluated.processing_seconds);
+            let (width, height) = (evaluated.report.width, evaluated.report.height);
+            let map = encode::plane(width, height, evaluated.surprise.into_iter());
+            Ok(Held {
+                reply: proto::EvaluateReply {
+                    report: Some(report),
+                    map: Some(map),
+                },
+                room: Some(room),
             })
-            .await?;
-        let room = self.room(size_of_val(evaluated.surprise.as_slice()))?;
-        let report = encode::report(&evaluated.report, name, evaluated.processing_seconds);
-        let (width, height) = (evaluated.report.width, evaluated.report.height);
-        let map = encode::plane(width, height, evaluated.surprise.into_iter());
-        Ok(Held {
-            reply: proto::EvaluateReply {
-                report: Some(report),
-                map: Some(map),
-            },
-            room: Some(room),
         })
+        .await
     }
 
     /// # Errors
@@ -200,15 +228,18 @@ impl Questions {
         place: &Place,
         request: &proto::ViewsRequest,
     ) -> Result<proto::ViewsReply, Refusal> {
-        let limit = match request.limit as usize {
-            0 => VIEWS_MAX,
-            limit => limit.min(VIEWS_MAX),
-        };
-        let after = request.after;
-        self.ask(place, |answer| Ask::Views {
-            after,
-            limit,
-            answer,
+        self.counted("views", async {
+            let limit = match request.limit as usize {
+                0 => VIEWS_MAX,
+                limit => limit.min(VIEWS_MAX),
+            };
+            let after = request.after;
+            self.ask(place, |answer| Ask::Views {
+                after,
+                limit,
+                answer,
+            })
+            .await
         })
         .await
     }
@@ -220,16 +251,19 @@ impl Questions {
         place: &Place,
         request: &proto::NextViewRequest,
     ) -> Result<proto::NextViewReply, Refusal> {
-        let question = questions::next_view(request, self.limits.image_pixels_max)?;
-        let ring = request.ring.as_ref();
-        let camera = match ring.map(|ring| (ring.robot.as_str(), ring.camera.as_str())) {
-            None => None,
-            Some((robot, camera)) => camera_named(robot, camera)?,
-        };
-        self.ask(place, |answer| Ask::NextView {
-            question,
-            camera,
-            answer,
+        self.counted("next_view", async {
+            let question = questions::next_view(request, self.limits.image_pixels_max)?;
+            let ring = request.ring.as_ref();
+            let camera = match ring.map(|ring| (ring.robot.as_str(), ring.camera.as_str())) {
+                None => None,
+                Some((robot, camera)) => camera_named(robot, camera)?,
+            };
+            self.ask(place, |answer| Ask::NextView {
+                question,
+                camera,
+                answer,
+            })
+            .await
         })
         .await
     }
@@ -241,9 +275,12 @@ impl Questions {
         place: &Place,
         request: &proto::ForgetRequest,
     ) -> Result<proto::ForgetReply, Refusal> {
-        let forgetting = Box::new(Forgetting::new(questions::forget(request)?));
-        self.ask(place, |answer| Ask::Forget { forgetting, answer })
-            .await
+        self.counted("forget", async {
+            let forgetting = Box::new(Forgetting::new(questions::forget(request)?));
+            self.ask(place, |answer| Ask::Forget { forgetting, answer })
+                .await
+        })
+        .await
     }
 
     /// How cameras of the place begin, or how they are all to be from now on.
@@ -251,14 +288,17 @@ impl Questions {
     /// # Errors
     /// `unknown_place`, `too_many_places`, `busy`, `late`.
     pub async fn mode_of_place(&self, name: &str, set: Option<Mode>) -> Result<Mode, Refusal> {
-        let place = match set {
-            None => self.place(name)?,
-            Some(_) => self.open(name)?,
-        };
-        self.ask(&place, |answer| Ask::Mode {
-            camera: None,
-            set,
-            answer,
+        self.counted("mode", async {
+            let place = match set {
+                None => self.place(name)?,
+                Some(_) => self.open(name)?,
+            };
+            self.ask(&place, |answer| Ask::Mode {
+                camera: None,
+                set,
+                answer,
+            })
+            .await
         })
         .await
     }
@@ -268,6 +308,7 @@ impl Questions {
     /// # Errors
     /// `unknown_place`, `unknown_camera`, `too_many_places`, `too_many_cameras`, `busy`, `late`.
     pub async fn mode(&self, path: &CameraPath, set: Option<Mode>) -> Result<Mode, Refusal> {
+        self.counted("mode", async {
         let place = match set {
             None => {
                 let place = self.place(&path.place)?;
@@ -291,6 +332,7 @@ impl Questions {
             answer,
         })
         .await
+        }).await
     }
 
     fn open(&self, name: &str) -> Result<Arc<Place>, Refusal> {

@@ -7,14 +7,17 @@ use std::{
     time::{Duration, Instant},
 };
 
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 
 use super::{
     ask::{Ask, Evaluated, Snapshot},
     camera::{Camera, Refused, Turn, lenses_alone, pose_alone, unpack},
+    events::{self, PlaceEvents},
     inbox::{Aside, CAMERAS_MAX, Delivery, Inbox},
+    live::News,
+    metrics::{Metrics, Stopwatches},
     publish::CameraPublisher,
-    status::{CameraStatus, PlaceStatus},
+    status::{CameraStatus, PlaceStatus, PlaceTotals},
     turns::{self, Hands, take_turns},
 };
 use crate::{
@@ -24,6 +27,7 @@ use crate::{
         mode::Mode,
         pose::{Pose, PoseNoise},
         refusal::Refusal,
+        report::Report,
     },
     pipeline::Pipeline,
     stages::next_view,
@@ -53,6 +57,10 @@ pub struct Worker {
     pub inbox: Arc<Inbox>,
     pub pipeline: Pipeline,
     pub status: watch::Sender<Arc<PlaceStatus>>,
+    pub events: watch::Sender<Arc<PlaceEvents>>,
+    pub metrics: Arc<Metrics>,
+    /// For whoever watches over HTTP.
+    pub news: Option<mpsc::Sender<News>>,
     /// Asks a robot for its calibration; the answer comes through the inbox.
     pub ask_calibration: Box<dyn Fn(&CameraPath) + Send>,
 }
@@ -67,6 +75,10 @@ struct Desk {
     /// Whose last frame the pipeline's maps are of.
     maps_of: Option<Source>,
     frames: u64,
+    /// Of cameras that made room for others, and what was refused.
+    frames_lost_before: u64,
+    refused_by: BTreeMap<&'static str, u64>,
+    stopwatches: Stopwatches,
     /// Set for the place since it began.
     place_mode: Option<Mode>,
     /// Set for single cameras since.
@@ -95,6 +107,9 @@ impl Worker {
             cameras: BTreeMap::new(),
             maps_of: None,
             frames: 0,
+            frames_lost_before: 0,
+            refused_by: BTreeMap::new(),
+            stopwatches: self.metrics.stopwatches(&self.place),
             place_mode: None,
             modes: BTreeMap::new(),
             asks: AskCounters::default(),
@@ -288,11 +303,11 @@ impl Desk {
                     wake = Some(wake.map_or(deadline, |wake| wake.min(deadline)));
                 }
                 Some(Turn::Refused(refused)) => self.refuse(&source, keys::FRAME, refused),
-                Some(Turn::Ready(pose, packed)) => {
+                Some(Turn::Ready(pose, packed, arrived)) => {
                     self.frames += 1;
                     camera.served = self.frames;
                     let (stamp_ns, sequence) = (packed.stamp_ns, packed.sequence);
-                    if let Err(refusal) = self.serve_frame(&source, pose, &packed) {
+                    if let Err(refusal) = self.serve_frame(&source, pose, &packed, arrived) {
                         self.frames -= 1;
                         self.refuse(
                             &source,
@@ -319,8 +334,9 @@ impl Desk {
         source: &Source,
         pose: Pose,
         packed: &PackedFrame,
+        arrived: Instant,
     ) -> Result<(), Refusal> {
-        let started = Instant::now();
+        let mut stopwatch = self.stopwatches.start();
         let mode = self.mode(source);
         let (limits, noise) = (self.limits, self.noise_default);
         let Some(camera) = self.cameras.get_mut(source) else {
@@ -328,29 +344,65 @@ impl Desk {
         };
         let lenses = camera.lenses(packed.calibration.as_ref(), limits)?;
         let frame = unpack(packed, &lenses, source.clone(), pose, noise, limits)?;
+        stopwatch.decoded();
         let pipeline = &mut self.worker.pipeline;
-        let report = pipeline.process_in(mode, &frame)?;
-        let processing_seconds = started.elapsed().as_secs_f64();
+        let report = pipeline.process_staged(mode, &frame, &mut |stage| stopwatch.ended(stage))?;
+        let processing_seconds = stopwatch.elapsed().as_secs_f64();
         self.maps_of = Some(source.clone());
         let message = encode::report(&report, &self.worker.place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
-        let world_from_camera = report.world_from_camera;
+        stopwatch.published(arrived);
         camera.processed(
             frame.image,
             lenses,
-            world_from_camera,
+            report.world_from_camera,
             message,
             frame.stamp_ns,
         );
         if camera.watched(Instant::now()) {
-            camera.show(|image| snapshot(pipeline, image));
+            camera.show(|image, report| snapshot(pipeline, image, report));
         }
+        self.tell(&report);
         Ok(())
+    }
+
+    /// Publishes what has changed about events, and tells the watchers of the frame.
+    fn tell(&self, report: &Report) {
+        let Worker {
+            place,
+            root,
+            session,
+            events,
+            metrics,
+            news,
+            ..
+        } = &self.worker;
+        let tell = |message| {
+            let Some(news) = news else { return };
+            if news.try_send(message).is_err() {
+                metrics.news_dropped.inc();
+            }
+        };
+        for event in &report.events {
+            let mut message = Arc::default();
+            events.send_modify(|events| message = Arc::make_mut(events).put(event, place));
+            events::publish(session, root, &message);
+            metrics.event(place, &message.kind, &message.state);
+            tell(News::Event(message));
+        }
+        tell(News::Frame {
+            place: place.clone(),
+            source: report.source.clone(),
+            stamp_ns: report.stamp_ns,
+            max_surprise: report.max_surprise,
+            coverage: report.coverage,
+        });
     }
 
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
         let root = self.worker.root.clone();
+        *self.refused_by.entry(refused.refusal.code).or_default() += 1;
         let Some(camera) = self.camera(source) else {
             return;
         };
@@ -412,7 +464,7 @@ impl Desk {
                     Some(known) => known.look(
                         answer,
                         Instant::now(),
-                        current.then_some(|image| snapshot(pipeline, image)),
+                        current.then_some(|image, report| snapshot(pipeline, image, report)),
                     ),
                     None => drop(answer.send(Err(unknown_camera()))),
                 }
@@ -558,10 +610,11 @@ impl Desk {
     fn publish_status(&mut self) {
         let slots = self.worker.inbox.cameras();
         let pipeline = &mut self.worker.pipeline;
-        self.cameras.retain(|source, _| {
+        self.cameras.retain(|source, camera| {
             let kept = slots.contains_key(source);
             if !kept {
                 pipeline.forget_camera(source);
+                self.frames_lost_before += camera.status.frames_lost;
             }
             kept
         });
@@ -581,10 +634,15 @@ impl Desk {
             .collect();
         let pipeline = &self.worker.pipeline;
         let memory = pipeline.memory();
-        self.worker.status.send_replace(Arc::new(PlaceStatus {
+        let lost: u64 = cameras.iter().map(|camera| camera.frames_lost).sum();
+        let engine = pipeline.engine();
+        let totals = PlaceTotals {
             place: self.worker.place.to_string(),
             frames: self.frames,
-            refused: cameras.iter().map(|camera| camera.refusals()).sum(),
+            refused: self.refused_by.values().sum(),
+            refused_by: self.refused_by.clone(),
+            frames_lost: self.frames_lost_before + lost,
+            inbox: self.worker.inbox.counters(),
             viewpoints: memory.viewpoints().len(),
             memory_bytes: memory.bytes(),
             memory_bytes_max: pipeline.settings().memory_bytes,
@@ -593,9 +651,12 @@ impl Desk {
             asks_answered: self.asks.answered,
             ask_passes: self.asks.passes,
             asks_abandoned: self.asks.abandoned,
-            asks_busy: self.worker.inbox.asks_busy(),
-            cameras,
-        }));
+            engine: engine.name().to_owned(),
+            open_events: self.worker.events.borrow().open().len(),
+            gpu: engine.counters().cloned(),
+        };
+        let status = PlaceStatus { totals, cameras };
+        self.worker.status.send_replace(Arc::new(status));
     }
 }
 
@@ -603,9 +664,14 @@ fn unknown_camera() -> Refusal {
     Refusal::new("unknown_camera", "no frame of this camera has come yet")
 }
 
-fn snapshot(pipeline: &Pipeline, frame: Arc<RgbImage>) -> Snapshot {
+fn snapshot(
+    pipeline: &Pipeline,
+    frame: Arc<RgbImage>,
+    report: Arc<proto::SurpriseReport>,
+) -> Snapshot {
     let maps = pipeline.maps();
     Snapshot {
+        report,
         frame,
         expected: picture::expected_rgb(&maps.prior),
         surprise: maps.score.surprise.clone(),

@@ -12,7 +12,7 @@ use super::{
     sensor::Sensor,
     story::{Item, Moment, PERSON, Story, furnishings},
     texture::Rgb,
-    tracer::{Lighting, Rendering, Tracer, depth_alone},
+    tracer::{Lighting, LitView, Rendering, Tracer, depth_alone},
     tracker::{Marker, TRACKER_HZ, Tracker},
 };
 use crate::{
@@ -59,6 +59,9 @@ pub struct Script {
     pub lighting: Lighting,
     furnishings: Vec<Item>,
 }
+
+/// A change of so many levels of 255 in a channel stands out of the sensor's noise, about one level.
+const TOUCHED_LEVELS: u8 = 4;
 
 /// Which of the three cameras are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -314,14 +317,14 @@ impl Script {
             + self.sensor.exposure_drift
                 * wander(self.seed, 0xe0 + station as u64, frame as f64 / 40.0);
         let key = |camera: u64| [station as u64, frame, camera];
-        let shot = |middle_from_camera: Option<&Pose>, camera: u64| {
+        let shot = |middle_from_camera: Option<&Pose>, camera: u64, beside: Option<&LitView>| {
             let pose_at = |frame: f64| {
                 let world_from_middle = self.world_from_camera(station, frame);
                 middle_from_camera.map_or(world_from_middle, |offset| world_from_middle * offset)
             };
             let intrinsics = &at.rig.intrinsics;
             let pose = pose_at(frame as f64);
-            let rendering = tracer.render(intrinsics, &pose);
+            let (rendering, view) = tracer.render_beside(intrinsics, &pose, beside);
             let blurred = self.blurred(&tracer, intrinsics, &rendering, frame as f64, pose_at);
             let image = self.sensor.expose(
                 blurred.as_ref().unwrap_or(&rendering.radiance),
@@ -340,15 +343,18 @@ impl Script {
                     self.mask(item, stands, intrinsics, &pose, &rendering)
                 })
                 .collect();
-            Shot {
+            let shot = Shot {
                 image,
                 depth_m: rendering.depth_m,
                 depth_through_glass_m: rendering.depth_through_glass_m,
                 object: rendering.object,
                 masks,
-            }
+            };
+            (shot, view)
         };
-        let middle = shot(None, 0);
+        let (middle, view) = shot(None, 0, None);
+        let side =
+            |middle_from_side: &Pose, camera| shot(Some(middle_from_side), camera, Some(&view)).0;
         Capture {
             stamp_ns: self.stamp_ns(frame),
             sequence: frame,
@@ -358,8 +364,8 @@ impl Script {
             middle,
             sides: (views == Views::Triple).then(|| {
                 (
-                    shot(Some(&at.rig.middle_from_left), 1),
-                    shot(Some(&at.rig.middle_from_right), 2),
+                    side(&at.rig.middle_from_left, 1),
+                    side(&at.rig.middle_from_right, 2),
                 )
             }),
             markers: self.observe(station, frame as f64),
@@ -367,6 +373,51 @@ impl Script {
             moment,
             pass: at.drive.pass(number),
         }
+    }
+
+    /// Where whatever comes and goes changes what the middle camera sees, be it its surface, shade, mirror image or
+    /// refraction, or a person: 255, else 0. Of all items in their places at once, so that it holds for those that are
+    /// yet to come or were taken away.
+    pub fn touched(&self, station: usize, capture: &Capture) -> Vec<u8> {
+        let intrinsics = &self.stations[station].rig.intrinsics;
+        let seen = |moment: &Moment| {
+            let scene = self.scene_of(moment);
+            let tracer = Tracer {
+                scene: &scene,
+                lighting: &self.lighting,
+            };
+            let rendering = tracer.render(intrinsics, &capture.world_from_camera);
+            // The same noise in both.
+            self.sensor.expose(
+                &rendering.radiance,
+                intrinsics.width,
+                1.0,
+                self.seed,
+                &[station as u64, capture.sequence],
+            )
+        };
+        let bare = Moment {
+            standing: Vec::new(),
+            carried: None,
+            person: None,
+            ..capture.moment.clone()
+        };
+        let crowded = Moment {
+            standing: (0..self.story.items.len()).collect(),
+            ..capture.moment.clone()
+        };
+        let (bare, crowded) = (seen(&bare), seen(&crowded));
+        bare.data
+            .chunks_exact(3)
+            .zip(crowded.data.chunks_exact(3))
+            .map(|(a, b)| {
+                let differs = a
+                    .iter()
+                    .zip(b)
+                    .any(|(a, b)| a.abs_diff(*b) >= TOUCHED_LEVELS);
+                if differs { 255 } else { 0 }
+            })
+            .collect()
     }
 
     /// Mean radiance while the shutter is open; `None` without motion blur.

@@ -56,6 +56,12 @@ impl Bounds {
     pub fn half(&self) -> Vector3<f64> {
         (self.max - self.min) * 0.5
     }
+
+    /// Square metres.
+    pub fn surface(&self) -> f64 {
+        let size = self.max - self.min;
+        2.0 * (size.x * size.y + size.y * size.z + size.z * size.x)
+    }
 }
 
 /// Where a ray met a shape. `part` is the face: of a frustum 0 side, 1 base, 2 top; of a solid the number of its plane.

@@ -2,6 +2,7 @@
 //!
 //! ```text
 //! rgb/<t>.jpg  depth/<t>.png (16 bit, metres * 5000, 0 = none)  mask/<item>/<t>.png (0 or 255)
+//! ignore/<t>.png (255: shade, mirror image or refraction of what comes and goes, or a person)
 //! rgb.txt  depth.txt  groundtruth.txt (t tx ty tz qx qy qz qw, world_from_camera)  calibration.txt  phases.csv
 //! ```
 
@@ -91,7 +92,7 @@ pub fn recording(dir: &Path, script: &Script, options: &Options) -> Result<Summa
         });
     };
     let names: Vec<_> = script.story.items.iter().map(|item| item.name).collect();
-    for folder in ["rgb".into(), "depth".into()]
+    for folder in ["rgb".into(), "depth".into(), "ignore".into()]
         .into_iter()
         .chain(names.iter().map(|name| format!("mask/{name}")))
     {
@@ -132,6 +133,12 @@ pub fn recording(dir: &Path, script: &Script, options: &Options) -> Result<Summa
         };
         let stamp = stamp_text(capture.stamp_ns);
         write_images(dir, &stamp, &capture, depth_m, &names, options.jpeg_quality)?;
+        let touched = script.touched(options.station, &capture);
+        write_grey(
+            dir.join(format!("ignore/{stamp}.png")),
+            &around_items(touched, &capture.middle.masks),
+            (camera.width, camera.height),
+        )?;
         rgb.line(&format!("{stamp} rgb/{stamp}.jpg"))?;
         depth.line(&format!("{stamp} depth/{stamp}.png"))?;
         poses.line(&format!("{stamp} {}", pose_text(&world_from_camera)))?;
@@ -193,11 +200,31 @@ fn write_images(
         PngEncoder::new(file).write_image(&depth, width, height, ExtendedColorType::L16)
     })?;
     for (name, mask) in names.iter().zip(&capture.middle.masks) {
-        encode(dir.join(format!("mask/{name}/{stamp}.png")), |file| {
-            PngEncoder::new(file).write_image(mask, width, height, ExtendedColorType::L8)
-        })?;
+        let path = dir.join(format!("mask/{name}/{stamp}.png"));
+        write_grey(path, mask, (image.width, image.height))?;
     }
     Ok(())
+}
+
+/// What is touched but part of no item.
+fn around_items(mut touched: Vec<u8>, masks: &[Vec<u8>]) -> Vec<u8> {
+    for mask in masks {
+        for (touched, &item) in touched.iter_mut().zip(mask) {
+            *touched &= !item;
+        }
+    }
+    touched
+}
+
+fn write_grey(
+    path: PathBuf,
+    values: &[u8],
+    (width, height): (usize, usize),
+) -> Result<(), WriteError> {
+    encode(path, |file| {
+        let (width, height) = (width as u32, height as u32);
+        PngEncoder::new(file).write_image(values, width, height, ExtendedColorType::L8)
+    })
 }
 
 fn encode(

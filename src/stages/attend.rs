@@ -233,6 +233,7 @@ fn region(members: &[usize], map: &[f32], seed: f32, border_px: usize, scene: &S
             || y_min < border_px
             || x_max + border_px > width
             || y_max + border_px > height,
+        event_id: 0,
     }
 }
 
@@ -262,7 +263,7 @@ fn center_in_world(members: &[usize], scene: &Scene) -> Option<Point3<f64>> {
 /// Frames a region may be missing and still be the same when it is back: a person's hand passes by in that time.
 const MISSED_MAX: u32 = 7;
 /// Regions whose centres are this close in the world are the same, metres: the size of a tabletop object.
-const SAME_WITHIN_M: f64 = 0.12;
+pub const SAME_WITHIN_M: f64 = 0.12;
 /// Without depth, boxes that overlap this much are.
 const SAME_IOU: f64 = 0.3;
 

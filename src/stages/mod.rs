@@ -24,4 +24,6 @@ pub mod surprise;
 
 pub mod attend;
 
+pub mod events;
+
 pub mod next_view;

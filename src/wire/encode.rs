@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use nalgebra::Point3;
 use prost::{Message, Name};
-use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor};
+use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor, SerializeOptions};
 use prost_types::Timestamp;
 
 use super::{picture, proto};
@@ -12,11 +12,12 @@ use crate::{
     memory::forget::Forgotten,
     model::{
         camera::{Calibration, Intrinsics, RigCalibration, SideCalibrations},
+        event::{EndReason, Event, Kind, Picture, Sighting, State},
         frame::{DepthSource, Frame, GreyImage, RgbImage, RigFrame},
         mode::Mode,
         pose::Pose,
         refusal::Refusal,
-        report::{Region, Report},
+        report::{PixelBox, Region, Report},
         viewpoint::Viewpoint,
     },
     pipeline::{Maps, PriorAt},
@@ -46,11 +47,17 @@ pub(super) fn descriptor<M: Named>() -> MessageDescriptor {
         .expect("every message of the contract is described")
 }
 
-/// As protobuf's JSON mapping says.
+/// As protobuf's JSON mapping says, with the fields' own names and all of them: what is not there cannot be told from
+/// what a reader misspelt.
 pub fn json<M: Named>(message: &M) -> serde_json::Value {
     let dynamic = DynamicMessage::decode(descriptor::<M>(), message.encode_to_vec().as_slice())
         .expect("a message decodes as itself");
-    serde_json::to_value(&dynamic).expect("messages map to JSON")
+    let options = SerializeOptions::new()
+        .use_proto_field_name(true)
+        .skip_default_fields(false);
+    dynamic
+        .serialize_with_options(serde_json::value::Serializer, &options)
+        .expect("messages map to JSON")
 }
 
 pub fn timestamp(stamp_ns: i64) -> Timestamp {
@@ -273,15 +280,19 @@ pub fn report(report: &Report, place: &str, processing_seconds: f64) -> proto::S
     }
 }
 
+fn pixel_box(pixels: &PixelBox) -> proto::Box {
+    proto::Box {
+        x_min: pixels.x_min,
+        y_min: pixels.y_min,
+        x_max: pixels.x_max,
+        y_max: pixels.y_max,
+    }
+}
+
 fn region(region: &Region) -> proto::Region {
     proto::Region {
         id: region.id,
-        r#box: Some(proto::Box {
-            x_min: region.pixel_box.x_min,
-            y_min: region.pixel_box.y_min,
-            x_max: region.pixel_box.x_max,
-            y_max: region.pixel_box.y_max,
-        }),
+        r#box: Some(pixel_box(&region.pixel_box)),
         peak_x: region.peak_x,
         peak_y: region.peak_y,
         peak_surprise: region.peak_surprise,
@@ -290,6 +301,74 @@ fn region(region: &Region) -> proto::Region {
         center_in_world: region.center_in_world.as_ref().map(vector),
         touches_border: region.touches_border,
         keypoints: Vec::new(),
+        event_id: region.event_id,
+    }
+}
+
+/// For those who get the pictures on their own.
+pub fn event_json(event: &proto::Event) -> serde_json::Value {
+    json(&proto::Event {
+        picture: None,
+        expected_picture: None,
+        ..event.clone()
+    })
+}
+
+/// What was seen and what was expected, as jpeg.
+pub fn event_pictures(pictures: &Picture) -> (Option<proto::Image>, Option<proto::Image>) {
+    let jpeg = |rgb: &RgbImage| image("jpeg", rgb.width, rgb.height, picture::jpeg(rgb));
+    (
+        Some(jpeg(&pictures.seen)),
+        pictures.expected.as_ref().map(jpeg),
+    )
+}
+
+/// Without its pictures.
+pub fn event(event: &Event, place: &str) -> proto::Event {
+    proto::Event {
+        id: event.id,
+        place: place.to_owned(),
+        kind: match event.kind {
+            Kind::Change => "change",
+            Kind::Unseen => "unseen",
+        }
+        .to_owned(),
+        state: match event.state {
+            State::New => "new",
+            State::Update => "update",
+            State::End(_) => "end",
+        }
+        .to_owned(),
+        first_seen: Some(timestamp(event.first_seen_ns)),
+        last_seen: Some(timestamp(event.last_seen_ns)),
+        ended: event.ended_ns.map(timestamp),
+        end_reason: match event.state {
+            State::New | State::Update => "",
+            State::End(EndReason::SeenAgain) => "seen_again",
+            State::End(EndReason::NoRoom) => "no_room",
+        }
+        .to_owned(),
+        center_in_world: event.center_in_world.as_ref().map(vector),
+        extent_in_world: Some(vector(&event.extent_in_world.into())),
+        peak_surprise: event.peak_surprise,
+        unseen_share: event.unseen_share,
+        sightings: event.sightings,
+        robots: event.robots.iter().map(|robot| robot.to_string()).collect(),
+        peak: Some(sighting(&event.peak)),
+        last: Some(sighting(&event.last)),
+        picture: None,
+        expected_picture: None,
+    }
+}
+
+fn sighting(sighting: &Sighting) -> proto::Sighting {
+    proto::Sighting {
+        stamp: Some(timestamp(sighting.stamp_ns)),
+        robot: sighting.source.robot.to_string(),
+        camera: sighting.source.camera.to_string(),
+        sequence: sighting.sequence,
+        r#box: Some(pixel_box(&sighting.pixel_box)),
+        surprise: sighting.surprise,
     }
 }
 

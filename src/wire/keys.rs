@@ -5,6 +5,7 @@
 //! <root>/<place>/<robot>/<camera>/surprise/{report|map|...|rejected} from the service
 //! <root>/<place>/<robot>/<camera>/mode                               put and queryable
 //! <root>/<place>/@memory/{prior|evaluate|views|status|...}           queryables
+//! <root>/<place>/@events/<id>                                        events, put and queryable
 //! <root>/<place>/@live/robot/<robot>/<camera>                        liveliness of cameras
 //! <root>/<place>/@live/service/<session>                             liveliness of services
 //! ```
@@ -111,6 +112,11 @@ pub fn live_service(root: &str, place: &str, session: &str) -> String {
 
 pub fn memory(root: &str, place: &str, question: &str) -> String {
     format!("{root}/{place}/@memory/{question}")
+}
+
+/// `id`: an event's, or `*`.
+pub fn event(root: &str, place: &str, id: impl std::fmt::Display) -> String {
+    format!("{root}/{place}/@events/{id}")
 }
 
 /// Place and question of a [`memory`] key; `None` where the place is not an id.

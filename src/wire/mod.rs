@@ -9,6 +9,8 @@ pub mod encode;
 
 pub mod picture;
 
+pub mod schema;
+
 /// The messages as the contract has them; nothing in them has been checked.
 pub mod proto {
     include!(concat!(env!("OUT_DIR"), "/surprised.v1.rs"));

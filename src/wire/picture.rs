@@ -2,19 +2,16 @@
 
 use std::io::Cursor;
 
-use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
-
-use crate::{
-    model::{
-        belief::{CHANNELS, rgb_from_ycbcr},
-        frame::RgbImage,
-    },
-    stages::interpolate::prior::{ALPHA, BETA, COVERAGE, Prior, TAU},
-    wire::{encode::PriorPlane, proto},
+use image::{
+    ExtendedColorType, ImageEncoder,
+    codecs::{jpeg::JpegEncoder, png::PngEncoder},
 };
 
-/// What nobody saw is shown in a grey that stands back.
-const UNSEEN_RGB: [u8; 3] = [40, 40, 40];
+use crate::{
+    model::{belief::CHANNELS, frame::RgbImage},
+    stages::interpolate::prior::{ALPHA, BETA, Prior},
+    wire::{encode::PriorPlane, proto},
+};
 
 /// An RGB png. Fast rather than small: it is looked at once.
 pub fn png(rgb: &RgbImage) -> Vec<u8> {
@@ -30,17 +27,27 @@ pub fn png(rgb: &RgbImage) -> Vec<u8> {
     bytes.into_inner()
 }
 
+/// An RGB jpeg, for small pictures that are kept.
+pub fn jpeg(rgb: &RgbImage) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    JpegEncoder::new_with_quality(&mut bytes, 80)
+        .write_image(
+            &rgb.data,
+            rgb.width as u32,
+            rgb.height as u32,
+            ExtendedColorType::Rgb8,
+        )
+        .expect("writing to memory does not fail");
+    bytes
+}
+
 /// Tau in RGB.
 pub fn expected_rgb(prior: &Prior) -> RgbImage {
     let mut data = Vec::with_capacity(prior.width * prior.height * 3);
     for y in 0..prior.height {
         let row = prior.row(y);
         for x in 0..prior.width {
-            data.extend_from_slice(&if row.plane(COVERAGE)[x] > 0.0 {
-                rgb_from_ycbcr([TAU, TAU + 1, TAU + 2].map(|plane| row.plane(plane)[x]))
-            } else {
-                UNSEEN_RGB
-            });
+            data.extend_from_slice(&row.expected_rgb(x));
         }
     }
     RgbImage {

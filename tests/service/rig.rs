@@ -10,7 +10,7 @@ use surprised::{
         frame::{DepthSource, Frame, RgbImage, Source},
         pose::Pose,
     },
-    service::{Options, ServeError, Service, session::ZenohOptions},
+    service::{Options, ServeError, Service, access::HttpAccess, session::ZenohOptions},
     wire::{
         decode, encode,
         keys::{self, CameraPath},
@@ -55,6 +55,7 @@ impl Rig {
             settings: Settings::layered(Preset::Robust, None, &settings).expect("good settings"),
             root: "test/surprised".to_owned(),
             http: Some(([127, 0, 0, 1], 0).into()),
+            http_access: HttpAccess::default(),
             zenoh: ZenohOptions {
                 listen: vec!["tcp/127.0.0.1:0".to_owned()],
                 cfg: alone.to_vec(),

@@ -13,20 +13,25 @@
 //! A body may also be the message itself, as `application/protobuf`; and so may the reply, if that is accepted.
 
 use axum::{
-    Router,
     body::{Bytes, to_bytes},
     extract::{
-        Path, Query, Request, State,
+        Query, Request, State,
         rejection::{BytesRejection, QueryRejection},
     },
     http::{HeaderMap, StatusCode, header},
     response::{IntoResponse, Response},
-    routing::{get, post},
 };
 use serde::Deserialize;
 use tokio::sync::OwnedSemaphorePermit;
+use utoipa::IntoParams;
+use utoipa_axum::{router::OpenApiRouter, routes};
 
-use super::{App, problem::Problem};
+use super::{
+    App,
+    extract::Path,
+    message as described,
+    problem::{Document, Problem},
+};
 use crate::{
     model::refusal::Refusal,
     service::questions::{Held, Questions, camera_named, off_the_loop},
@@ -48,22 +53,15 @@ const FRAME_BYTES_MAX: usize = 32 << 20;
 const PROTOBUF: &str = "application/protobuf";
 const PNG: &str = "image/png";
 
-pub fn routes() -> Router<App> {
-    let place = "/api/v1/places/{place}";
-    Router::new()
-        .route(&format!("{place}/views"), get(views))
-        .route(&format!("{place}/prior"), post(prior))
-        .route(&format!("{place}/evaluate"), post(evaluate))
-        .route(&format!("{place}/next_view"), post(next_view))
-        .route(&format!("{place}/forget"), post(forget))
-        .route(
-            &format!("{place}/mode"),
-            get(place_mode).put(set_place_mode),
-        )
-        .route(
-            &format!("{place}/robots/{{robot}}/{{camera}}/mode"),
-            get(camera_mode).put(set_camera_mode),
-        )
+pub fn routes() -> OpenApiRouter<App> {
+    OpenApiRouter::new()
+        .routes(routes!(views))
+        .routes(routes!(prior))
+        .routes(routes!(evaluate))
+        .routes(routes!(next_view))
+        .routes(routes!(forget))
+        .routes(routes!(place_mode, set_place_mode))
+        .routes(routes!(camera_mode, set_camera_mode))
 }
 
 /// Whether a header names this type, whatever else it says.
@@ -142,6 +140,17 @@ fn sent(media_type: &'static str, bytes: Vec<u8>, room: Option<OwnedSemaphorePer
     (headers, Bytes::from_owner(Sending(bytes, room))).into_response()
 }
 
+/// What would be seen from a pose; accept image/png to have its first plane as a picture
+#[utoipa::path(post, path = "/api/v1/places/{place}/prior", tag = "memory",
+    params(("place" = String, Path)),
+    request_body = described::PriorRequest,
+    responses(
+        (status = 200, content((described::PriorReply = "application/json"), (Vec<u8> = "image/png"))),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn prior(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -170,13 +179,25 @@ async fn prior(
 }
 
 /// Whose calibration and visit an evaluated frame borrows.
-#[derive(Debug, Deserialize, Default)]
+#[derive(Debug, Deserialize, Default, IntoParams)]
 #[serde(default)]
+#[into_params(parameter_in = Query)]
 struct Borrowed {
     robot: String,
     camera: String,
 }
 
+/// How surprising a frame would be; nothing is learnt
+#[utoipa::path(post, path = "/api/v1/places/{place}/evaluate", tag = "memory",
+    params(("place" = String, Path), Borrowed),
+    request_body = described::EvaluateRequest,
+    responses(
+        (status = 200, body = described::EvaluateReply),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn evaluate(
     State(app): State<App>,
     Path(name): Path<String>,
@@ -205,6 +226,17 @@ async fn evaluate(
     Ok(reply(&head.headers, &evaluated.reply, evaluated.room))
 }
 
+/// From which pose a picture would teach most
+#[utoipa::path(post, path = "/api/v1/places/{place}/next_view", tag = "memory",
+    params(("place" = String, Path)),
+    request_body = described::NextViewRequest,
+    responses(
+        (status = 200, body = described::NextViewReply),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn next_view(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -218,6 +250,17 @@ async fn next_view(
     Ok(reply(&headers, &ranked, None))
 }
 
+/// Takes something out of the memory, for good
+#[utoipa::path(post, path = "/api/v1/places/{place}/forget", tag = "memory",
+    params(("place" = String, Path)),
+    request_body = described::ForgetRequest,
+    responses(
+        (status = 200, body = described::ForgetReply),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn forget(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -232,13 +275,24 @@ async fn forget(
 }
 
 /// Which of the viewpoints.
-#[derive(Debug, Deserialize, Default)]
+#[derive(Debug, Deserialize, Default, IntoParams)]
 #[serde(default)]
+#[into_params(parameter_in = Query)]
 struct Page {
     after: u64,
     limit: u32,
 }
 
+/// The memory's viewpoints, in the order of their ids
+#[utoipa::path(get, path = "/api/v1/places/{place}/views", tag = "memory",
+    params(("place" = String, Path), Page),
+    responses(
+        (status = 200, body = described::ViewsReply),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn views(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -254,6 +308,16 @@ async fn views(
     Ok(reply(&headers, &views, None))
 }
 
+/// How cameras begin
+#[utoipa::path(get, path = "/api/v1/places/{place}/mode", tag = "memory",
+    params(("place" = String, Path)),
+    responses(
+        (status = 200, body = described::Mode),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn place_mode(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -263,6 +327,17 @@ async fn place_mode(
     Ok(reply(&headers, &encode::mode(now), None))
 }
 
+/// How all cameras are from now on: learn, observe or freeze
+#[utoipa::path(put, path = "/api/v1/places/{place}/mode", tag = "memory",
+    params(("place" = String, Path)),
+    request_body = described::Mode,
+    responses(
+        (status = 200, body = described::Mode),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn set_place_mode(
     State(app): State<App>,
     Path(place): Path<String>,
@@ -281,6 +356,16 @@ fn camera_path(place: &str, robot: &str, camera: &str) -> Result<CameraPath, Pro
         .ok_or_else(|| Problem::not_found("places, robots and cameras are [a-z0-9_-]+"))
 }
 
+/// How a camera's frames are taken
+#[utoipa::path(get, path = "/api/v1/places/{place}/robots/{robot}/{camera}/mode", tag = "memory",
+    params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
+    responses(
+        (status = 200, body = described::Mode),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn camera_mode(
     State(app): State<App>,
     Path((place, robot, camera)): Path<(String, String, String)>,
@@ -291,6 +376,17 @@ async fn camera_mode(
     Ok(reply(&headers, &encode::mode(now), None))
 }
 
+/// How a camera's frames are taken from now on: learn, observe or freeze
+#[utoipa::path(put, path = "/api/v1/places/{place}/robots/{robot}/{camera}/mode", tag = "memory",
+    params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
+    request_body = described::Mode,
+    responses(
+        (status = 200, body = described::Mode),
+        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
+            content_type = "application/problem+json"),
+        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
+        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+    ))]
 async fn set_camera_mode(
     State(app): State<App>,
     Path((place, robot, camera)): Path<(String, String, String)>,

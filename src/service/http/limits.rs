@@ -17,8 +17,8 @@ use tokio::{
     time::{Instant, Sleep, sleep},
 };
 
-/// A page, a monitor or two and a few people; each takes a descriptor and a buffer.
-const CONNECTIONS_MAX: usize = 64;
+/// Those who watch, and as many who ask; each takes a descriptor and a buffer.
+const CONNECTIONS_MAX: usize = 512;
 /// Longer than any answer takes; shorter than anybody can hold a connection by saying nothing.
 const SILENCE_MAX: Duration = Duration::from_secs(30);
 

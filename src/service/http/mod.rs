@@ -1,60 +1,74 @@
 //! The service for people and monitors, over HTTP.
 //!
 //! ```text
-//! GET /healthz                                      the process answers
-//! GET /readyz                                       everything is up
-//! GET /api/v1/info                                  version, endpoints, settings
-//! GET /api/v1/places                                names
-//! GET /api/v1/places/{place}                        status and counters
-//! GET /api/v1/places/{place}/views                  the memory's viewpoints
-//! GET /api/v1/places/{place}/robots/{robot}/{camera}            the camera's status and last report
-//! GET .../robots/{robot}/{camera}/{frame|expected|surprise|uncertainty}.png
-//! POST /api/v1/places/{place}/{prior|evaluate|next_view|forget}     questions, see [`asks`]
-//! GET, PUT /api/v1/places/{place}/mode, .../robots/{robot}/{camera}/mode
+//! GET  /                                             the page for people
+//! GET  /healthz                                     the process answers
+//! GET  /readyz                                      everything is up
+//! GET  /metrics                                     OpenMetrics
+//! GET  /openapi.json                                all of this, for programs
+//! GET  /events                                      what happens, as server-sent events
+//! GET  POST DELETE /api/v1/session                  signing in with a browser
+//! GET  /api/v1/info                                 version, endpoints, settings
+//! GET  /api/v1/places                               names
+//! GET  /api/v1/places/{place}                       status and counters
+//! GET  /api/v1/places/{place}/views                 the memory's viewpoints
+//! GET  /api/v1/places/{place}/events                those that last, and those that ended lately
+//! GET  /api/v1/places/{place}/events/{event}        one of them
+//! GET  .../events/{event}/{seen|expected}.jpg
+//! GET  /api/v1/places/{place}/timeline              surprise of the last quarter of an hour
+//! GET  /api/v1/places/{place}/robots/{robot}/{camera}            the camera's status and last report
+//! GET  .../robots/{robot}/{camera}/{frame|expected|surprise|uncertainty}.png
+//! POST /api/v1/places/{place}/{prior|evaluate|next_view|forget}  questions, see [`asks`]
+//! GET  PUT /api/v1/places/{place}/mode, .../robots/{robot}/{camera}/mode
 //! ```
 //!
-//! Status is read from published snapshots; everything else is asked of the place's worker. Errors are
-//! `application/problem+json`.
+//! Status is read from published snapshots; views and pictures are asks to the place's worker. Errors are
+//! `application/problem+json`. Everything but the page, the first two, the description and signing in needs the token if
+//! there is one.
 
 mod asks;
 
+mod door;
+
+mod extract;
+
 mod limits;
 
+mod page;
+
+mod places;
+
 mod problem;
+
+mod watch;
 
 use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use axum::{
-    Json, Router,
-    extract::{DefaultBodyLimit, Path, State},
+    Router,
+    extract::{DefaultBodyLimit, FromRef, State},
     http::{StatusCode, header},
+    middleware,
     response::{IntoResponse, Response},
-    routing::get,
 };
+use prometheus_client::registry::Registry;
 use serde_json::{Value, json};
-use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
+use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle, time::timeout};
 use tower_http::timeout::TimeoutLayer;
+use utoipa::{OpenApi, openapi};
+use utoipa_axum::{router::OpenApiRouter, routes};
 
-use self::{limits::LimitedListener, problem::Problem};
+use self::{door::Door, limits::LimitedListener, problem::Problem};
 use super::{
-    ask::{Ask, Snapshot},
-    ingest::IngestCounters,
-    places::{Place, Places},
-    questions::Questions,
-    readiness::Readiness,
+    access::HttpAccess, ingest::IngestCounters, live::Live, metrics, places::Places,
+    questions::Questions, readiness::Readiness,
 };
-use crate::{
-    model::frame::{RgbImage, Source},
-    wire::{encode, picture},
-};
-
 /// A picture waits for the camera's next frame at most.
 const REQUEST_WITHIN: Duration = Duration::from_secs(10);
+/// Requests under way when the service stops.
+const FINISH_WITHIN: Duration = Duration::from_secs(2);
 const BODY_BYTES_MAX: usize = 1 << 20;
-/// Nats a pixel that are shown white.
-const SURPRISE_FULL: f32 = 60.0;
-/// Standard deviation, grey levels, that is shown white.
-const UNCERTAINTY_FULL: f32 = 60.0;
+const OPENMETRICS: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
 
 /// Filled in when the session is open.
 #[derive(Clone)]
@@ -62,6 +76,7 @@ pub struct Parts {
     pub places: Arc<Places>,
     pub counters: Arc<IngestCounters>,
     pub locators: Vec<String>,
+    pub live: Arc<Live>,
     pub questions: Arc<Questions>,
 }
 
@@ -69,24 +84,38 @@ pub struct Parts {
 struct App {
     readiness: Readiness,
     parts: Parts,
+    registry: Arc<Registry>,
+    clients: watch::Clients,
+    door: Arc<Door>,
+}
+
+impl FromRef<App> for Arc<Door> {
+    fn from_ref(app: &App) -> Self {
+        app.door.clone()
+    }
 }
 
 /// A bound server; it ends when dropped or stopped.
 pub struct Server {
     pub addr: SocketAddr,
+    live: Arc<Live>,
     stop: Option<oneshot::Sender<()>>,
     task: JoinHandle<()>,
 }
 
 impl Server {
-    /// Lets requests under way finish.
+    /// Lets requests under way finish, for a while; those who watch are let go.
     pub async fn stop(mut self) {
+        self.live.close();
         // The receiver is gone only if the task is.
         if let Some(stop) = self.stop.take() {
             let _ = stop.send(());
         }
-        if let Err(error) = self.task.await {
-            tracing::warn!("the HTTP server failed: {error}");
+        match timeout(FINISH_WITHIN, &mut self.task).await {
+            Ok(Ok(())) => {}
+            Ok(Err(error)) => tracing::warn!("the HTTP server failed: {error}"),
+            // Somebody does not read what was sent.
+            Err(_) => self.task.abort(),
         }
     }
 }
@@ -94,11 +123,25 @@ impl Server {
 /// Serves on a listener that is already bound.
 ///
 /// # Errors
-/// The listener has no address.
-pub fn start(listener: TcpListener, readiness: Readiness, parts: Parts) -> std::io::Result<Server> {
+/// The listener has no address, or the system no random numbers.
+pub fn start(
+    listener: TcpListener,
+    readiness: Readiness,
+    access: HttpAccess,
+    parts: Parts,
+) -> std::io::Result<Server> {
     let addr = listener.local_addr()?;
     let (stop, stopped) = oneshot::channel::<()>();
-    let router = router(App { readiness, parts });
+    let live = parts.live.clone();
+    let metrics = parts.places.metrics.clone();
+    let app = App {
+        registry: Arc::new(metrics.registry(&parts.places, parts.counters.clone())),
+        clients: watch::Clients::new(metrics.clone()),
+        door: Arc::new(Door::new(access, metrics)?),
+        readiness,
+        parts,
+    };
+    let router = router(app);
     let task = tokio::spawn(async move {
         let server = axum::serve(LimitedListener::new(listener), router).with_graceful_shutdown(
             async move {
@@ -112,40 +155,148 @@ pub fn start(listener: TcpListener, readiness: Readiness, parts: Parts) -> std::
     });
     Ok(Server {
         addr,
+        live,
         stop: Some(stop),
         task,
     })
 }
 
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "surprised",
+        description = "The surprise daemon: remembers how places look and notices when they look different. Metres, radians, nats, pixels; world_from_camera poses; camera axes x right, y down, z forward.",
+        license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0")
+    ),
+    security((), ("token" = []), ("session" = [])),
+    tags(
+        (name = "service", description = "The process"),
+        (name = "places", description = "What is known and seen"),
+        (name = "memory", description = "What is remembered: questions, modes, forgetting"),
+        (name = "events", description = "What has happened"),
+        (name = "session", description = "Signing in with a browser"),
+    )
+)]
+struct Description;
+
 fn router(app: App) -> Router {
-    let camera = "/api/v1/places/{place}/robots/{robot}/{camera}";
-    Router::new()
-        .route("/healthz", get(|| async { "ok\n" }))
-        .route("/readyz", get(readyz))
-        .route("/api/v1/info", get(info))
-        .route("/api/v1/places", get(places))
-        .route("/api/v1/places/{place}", get(place_status))
-        .route(camera, get(camera_status))
-        .route(&format!("{camera}/{{picture}}"), get(camera_picture))
+    let guarded = OpenApiRouter::new()
+        .routes(routes!(prometheus))
+        .routes(routes!(info))
+        .routes(routes!(places::list))
+        .routes(routes!(places::status))
+        .routes(routes!(places::camera))
+        .routes(routes!(places::picture))
+        .routes(routes!(watch::stream))
+        .routes(routes!(watch::events))
+        .routes(routes!(watch::event))
+        .routes(routes!(watch::event_picture))
+        .routes(routes!(watch::timeline))
         .merge(asks::routes())
+        .route_layer(middleware::from_fn_with_state(
+            app.door.clone(),
+            door::token,
+        ));
+    let (router, description) = OpenApiRouter::with_openapi(Description::openapi())
+        .routes(routes!(healthz))
+        .routes(routes!(readyz))
+        .routes(routes!(door::session, door::sign_in, door::sign_out))
+        .merge(guarded)
+        .split_for_parts();
+    let description: Arc<str> = described(description).to_string().into();
+    router
+        .merge(page::routes())
+        .route(
+            "/openapi.json",
+            axum::routing::get(move || {
+                let json = [(header::CONTENT_TYPE, "application/json")];
+                let description = description.to_string();
+                async move { (json, description) }
+            }),
+        )
         .fallback(|| async {
-            Problem::not_found("there is no such page: /api/v1/places is a start")
-        })
-        .method_not_allowed_fallback(|| async {
-            Problem::new(
-                StatusCode::METHOD_NOT_ALLOWED,
-                "method",
-                "this page is not asked for in this way: most are read with GET, questions are asked with POST, modes are set with PUT",
+            Problem::not_found(
+                "there is no such page: /api/v1/places is a start, /openapi.json has all",
             )
         })
+        .method_not_allowed_fallback(|| async { Problem::of(StatusCode::METHOD_NOT_ALLOWED) })
         .layer(TimeoutLayer::with_status_code(
             StatusCode::GATEWAY_TIMEOUT,
             REQUEST_WITHIN,
         ))
         .layer(DefaultBodyLimit::max(BODY_BYTES_MAX))
+        .layer(middleware::from_fn_with_state(
+            app.door.clone(),
+            door::guard,
+        ))
         .with_state(app)
 }
 
+/// With how to sign in, and with what only the messages' own description knows.
+fn described(description: openapi::OpenApi) -> Value {
+    let mut description = serde_json::to_value(&description).expect("descriptions map to JSON");
+    let components = &mut description["components"];
+    components["securitySchemes"] = json!({
+        "token": { "type": "http", "scheme": "bearer" },
+        "session": { "type": "apiKey", "in": "cookie", "name": door::COOKIE },
+    });
+    let schemas = &mut components["schemas"];
+    for (name, schema) in message::schemas() {
+        schemas[name] = schema;
+    }
+    description
+}
+
+/// Stand for messages of the contract, whose own descriptions take their places.
+mod message {
+    use serde_json::Value;
+    use utoipa::ToSchema;
+
+    use crate::wire::{proto, schema};
+
+    macro_rules! messages {
+        ($($direction:ident $name:ident),* $(,)?) => {
+            $(
+                #[derive(ToSchema)]
+                pub struct $name {}
+            )*
+
+            pub fn schemas() -> Vec<(&'static str, Value)> {
+                vec![$((stringify!($name), schema::$direction::<proto::$name>())),*]
+            }
+        };
+    }
+
+    messages!(
+        reply Event,
+        reply SurpriseReport,
+        reply ViewsReply,
+        request PriorRequest,
+        reply PriorReply,
+        request EvaluateRequest,
+        reply EvaluateReply,
+        request NextViewRequest,
+        reply NextViewReply,
+        request ForgetRequest,
+        reply ForgetReply,
+        request Mode,
+    );
+}
+
+/// Whether the process answers
+#[utoipa::path(get, path = "/healthz", tag = "service", security(()),
+    responses((status = 200, body = String, content_type = "text/plain")))]
+async fn healthz() -> &'static str {
+    "ok\n"
+}
+
+/// Whether everything is up
+#[utoipa::path(get, path = "/readyz", tag = "service", security(()),
+    responses(
+        (status = 200, body = String, content_type = "text/plain"),
+        (status = 503, description = "What is not up", body = problem::Document,
+            content_type = "application/problem+json"),
+    ))]
 async fn readyz(State(app): State<App>) -> Response {
     let missing = app.readiness.missing();
     if missing.is_empty() {
@@ -160,108 +311,34 @@ async fn readyz(State(app): State<App>) -> Response {
     }
 }
 
-async fn info(State(app): State<App>) -> Json<Value> {
+/// What Prometheus scrapes, as OpenMetrics
+#[utoipa::path(get, path = "/metrics", tag = "service",
+    responses(
+        (status = 200, body = String, content_type = "application/openmetrics-text"),
+        (status = "4XX", description = "No token", body = problem::Document,
+            content_type = "application/problem+json"),
+    ))]
+async fn prometheus(State(app): State<App>) -> Response {
+    let text = metrics::text(&app.registry);
+    ([(header::CONTENT_TYPE, OPENMETRICS)], text).into_response()
+}
+
+/// Version, endpoints and every setting
+#[utoipa::path(get, path = "/api/v1/info", tag = "service",
+    responses(
+        (status = 200, body = Object),
+        (status = "4XX", description = "No token", body = problem::Document,
+            content_type = "application/problem+json"),
+    ))]
+async fn info(State(app): State<App>) -> axum::Json<Value> {
     let places = &app.parts.places;
-    Json(json!({
+    axum::Json(json!({
         "name": env!("CARGO_PKG_NAME"),
         "version": env!("CARGO_PKG_VERSION"),
+        "boot": app.parts.live.boot.to_string(),
         "root": &*places.root,
         "zenoh": { "id": places.session.zid().to_string(), "locators": app.parts.locators },
         "settings": places.settings,
         "ingest": &*app.parts.counters,
     }))
-}
-
-async fn places(State(app): State<App>) -> Json<Value> {
-    let names: Vec<String> = app
-        .parts
-        .places
-        .all()
-        .into_iter()
-        .map(|(name, _)| name.to_string())
-        .collect();
-    Json(json!({ "places": names }))
-}
-
-fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
-    app.parts
-        .places
-        .get(place)
-        .ok_or_else(|| Problem::not_found("this place is unknown: it begins with its first frame"))
-}
-
-async fn place_status(
-    State(app): State<App>,
-    Path(place): Path<String>,
-) -> Result<Json<Value>, Problem> {
-    let status = known(&app, &place)?.status.borrow().clone();
-    Ok(Json(json!(*status)))
-}
-
-async fn camera_status(
-    State(app): State<App>,
-    Path((place, robot, camera)): Path<(String, String, String)>,
-) -> Result<Json<Value>, Problem> {
-    let status = known(&app, &place)?.status.borrow().clone();
-    let camera = status
-        .cameras
-        .iter()
-        .find(|known| known.robot == robot && known.camera == camera)
-        .ok_or_else(|| Problem::not_found("no frame of this camera has come yet"))?;
-    Ok(Json(json!({
-        "status": camera,
-        "report": camera.report.as_deref().map(encode::json),
-    })))
-}
-
-type Draw = fn(&Snapshot) -> RgbImage;
-
-async fn camera_picture(
-    State(app): State<App>,
-    Path((place, robot, camera, picture)): Path<(String, String, String, String)>,
-) -> Result<Response, Problem> {
-    let draw: Draw = match picture.as_str() {
-        "frame.png" => |snapshot| (*snapshot.frame).clone(),
-        "expected.png" => |snapshot| snapshot.expected.clone(),
-        "surprise.png" => |snapshot| heat(snapshot, &snapshot.surprise, SURPRISE_FULL),
-        "uncertainty.png" => |snapshot| {
-            let deviation: Vec<f32> = snapshot.uncertainty.iter().map(|v| v.sqrt()).collect();
-            heat(snapshot, &deviation, UNCERTAINTY_FULL)
-        },
-        _ => {
-            return Err(Problem::not_found(
-                "there are frame.png, expected.png, surprise.png and uncertainty.png",
-            ));
-        }
-    };
-    let place = known(&app, &place)?;
-    let camera = Source {
-        robot: robot.into(),
-        camera: camera.into(),
-    };
-    let questions = &app.parts.questions;
-    let snapshot = questions
-        .ask(&place, |answer| Ask::Snapshot { camera, answer })
-        .await?;
-    let png = tokio::task::spawn_blocking(move || picture::png(&draw(&snapshot)))
-        .await
-        .map_err(|error| {
-            Problem::new(
-                StatusCode::INTERNAL_SERVER_ERROR,
-                "picture",
-                error.to_string(),
-            )
-        })?;
-    Ok((
-        [
-            (header::CONTENT_TYPE, "image/png"),
-            (header::CACHE_CONTROL, "no-store"),
-        ],
-        png,
-    )
-        .into_response())
-}
-
-fn heat(snapshot: &Snapshot, values: &[f32], full: f32) -> RgbImage {
-    picture::heat(snapshot.frame.width, snapshot.frame.height, values, full)
 }

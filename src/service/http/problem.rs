@@ -3,17 +3,36 @@
 use std::borrow::Cow;
 
 use axum::{
+    extract::rejection::{JsonRejection, PathRejection, QueryRejection},
     http::{StatusCode, header},
     response::{IntoResponse, Response},
 };
-use serde_json::json;
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use crate::model::refusal::Refusal;
+
+pub const PROBLEM_JSON: &str = "application/problem+json";
 
 #[derive(Debug)]
 pub struct Problem {
     status: StatusCode,
     code: &'static str,
+    detail: Cow<'static, str>,
+}
+
+/// As it goes out.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Problem)]
+pub struct Document {
+    /// Always about:blank: `code` says what it is.
+    #[serde(rename = "type")]
+    kind: &'static str,
+    title: Option<&'static str>,
+    status: u16,
+    /// One word, for programs.
+    code: &'static str,
+    /// One sentence, for people: what is wrong and what to do.
     detail: Cow<'static, str>,
 }
 
@@ -33,6 +52,30 @@ impl Problem {
     pub fn not_found(detail: &'static str) -> Self {
         Self::new(StatusCode::NOT_FOUND, "not_found", detail)
     }
+
+    fn bad_request(detail: String) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "bad_request", detail)
+    }
+
+    /// Of a status that a layer gave without a word.
+    pub fn of(status: StatusCode) -> Self {
+        let (code, detail) = match status {
+            StatusCode::PAYLOAD_TOO_LARGE => (
+                "body_too_large",
+                "the request's body is longer than a mebibyte: send less",
+            ),
+            StatusCode::GATEWAY_TIMEOUT => (
+                "timeout",
+                "no answer in time: is the camera still sending frames, or the place busy?",
+            ),
+            StatusCode::METHOD_NOT_ALLOWED => {
+                ("method", "this path has other methods: see /openapi.json")
+            }
+            status if status.is_client_error() => ("bad_request", "the request cannot be read"),
+            _ => ("internal", "this is a bug; the log says more"),
+        };
+        Self::new(status, code, detail)
+    }
 }
 
 impl From<Refusal> for Problem {
@@ -49,20 +92,43 @@ impl From<Refusal> for Problem {
     }
 }
 
+impl From<PathRejection> for Problem {
+    fn from(rejection: PathRejection) -> Self {
+        Self::bad_request(rejection.body_text())
+    }
+}
+
+impl From<QueryRejection> for Problem {
+    fn from(rejection: QueryRejection) -> Self {
+        Self::bad_request(rejection.body_text())
+    }
+}
+
+impl From<JsonRejection> for Problem {
+    fn from(rejection: JsonRejection) -> Self {
+        match rejection.status() {
+            status @ StatusCode::PAYLOAD_TOO_LARGE => Self::of(status),
+            status @ StatusCode::UNSUPPORTED_MEDIA_TYPE => Self::new(
+                status,
+                "media_type",
+                "send JSON, with the header Content-Type: application/json",
+            ),
+            _ => Self::bad_request(rejection.body_text()),
+        }
+    }
+}
+
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
-        let body = json!({
-            "type": "about:blank",
-            "title": self.status.canonical_reason(),
-            "status": self.status.as_u16(),
-            "code": self.code,
-            "detail": self.detail,
-        });
-        (
-            self.status,
-            [(header::CONTENT_TYPE, "application/problem+json")],
-            body.to_string(),
-        )
-            .into_response()
+        let document = Document {
+            kind: "about:blank",
+            title: self.status.canonical_reason(),
+            status: self.status.as_u16(),
+            code: self.code,
+            detail: self.detail,
+        };
+        let body = serde_json::to_string(&document).expect("problems map to JSON");
+        let headers = [(header::CONTENT_TYPE, PROBLEM_JSON)];
+        (self.status, headers, body).into_response()
     }
 }

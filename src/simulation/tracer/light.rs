@@ -9,9 +9,12 @@ use super::{
     LIFT, Path, Scratch, Tracer,
     tiles::{TILE, Tile},
 };
-use crate::simulation::{
-    scene::{Hit, Light},
-    shapes::{Bounds, Ray},
+use crate::{
+    model::{camera::Intrinsics, pose::Pose},
+    simulation::{
+        scene::{Hit, Light},
+        shapes::{Bounds, Ray},
+    },
 };
 
 const LAMP_SAMPLES: usize = 9;
@@ -34,6 +37,77 @@ pub(super) struct Lit {
     pub(super) face: (usize, usize),
     pub(super) sky: f32,
     pub(super) lamp: f32,
+}
+
+/// The light on everything that a camera sees.
+pub struct LitView {
+    /// Of every pixel, row by row.
+    pub(super) lit: Vec<Lit>,
+    depth_m: Vec<f32>,
+    camera: Intrinsics,
+    camera_from_world: Pose,
+}
+
+/// Depths that differ by more, relative to themselves, are not of one place on a face.
+const SAME_DEPTH: f64 = 0.03;
+/// Of the four pixels around a point, those that show its face must have so much of the weight.
+const ENOUGH: f32 = 0.2;
+
+impl LitView {
+    pub(super) fn new(
+        lit: Vec<Lit>,
+        depth_m: Vec<f32>,
+        camera: Intrinsics,
+        world_from_camera: &Pose,
+    ) -> Self {
+        Self {
+            lit,
+            depth_m,
+            camera,
+            camera_from_world: world_from_camera.inverse(),
+        }
+    }
+
+    /// The light on a point, if the camera sees the place: from the pixels around it that show the same face.
+    pub(super) fn light_at(&self, hit: &Hit, point: &Point3<f64>) -> Option<Lit> {
+        let in_camera = self.camera_from_world * point;
+        if in_camera.z <= 0.0 {
+            return None;
+        }
+        let (u, v) = self.camera.project(&in_camera)?;
+        let Intrinsics { width, height, .. } = self.camera;
+        // Also false for what is not a number.
+        let inside = u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64;
+        if !inside {
+            return None;
+        }
+        let (column, row) = (u as usize, v as usize);
+        let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
+        let face = (hit.primitive, hit.crossing.part);
+        let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
+        for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
+            for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
+                let near = across * along;
+                // Rectified cameras meet in whole rows.
+                if near < 1e-4 || column >= width || row >= height {
+                    continue;
+                }
+                let at = row * width + column;
+                let lit = &self.lit[at];
+                let apart = (f64::from(self.depth_m[at]) - in_camera.z).abs();
+                if lit.face == face && apart < SAME_DEPTH * in_camera.z {
+                    weight += near;
+                    sky += near * lit.sky;
+                    lamp += near * lit.lamp;
+                }
+            }
+        }
+        (weight > ENOUGH).then(|| Lit {
+            face,
+            sky: sky / weight,
+            lamp: lamp / weight,
+        })
+    }
 }
 
 /// Nothing, or glass, which has no light of its own.
@@ -143,7 +217,7 @@ fn in_beam(
 
 impl Tracer<'_> {
     /// Finds what may shade any of the points that a tile sees.
-    pub(super) fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
+    fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
         tile.reach = Bounds::of(
             seen.iter()
                 .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
@@ -175,11 +249,12 @@ impl Tracer<'_> {
     }
 
     /// Finds the light on every point that a tile sees: exactly at every sixteenth pixel, at every fourth where those
-    /// of the tile differ, and between these where the edge of a shadow is.
+    /// of the tile differ, and between these where the edge of a shadow is; at none that the camera `beside` sees too.
     pub(super) fn light(
         &self,
-        tile: &Tile,
+        tile: &mut Tile,
         seen: &[(usize, Path, f64, Option<Hit>)],
+        beside: Option<&LitView>,
         lit: &mut [Lit],
         width: usize,
         scratch: &mut Scratch,
@@ -189,6 +264,26 @@ impl Tracer<'_> {
         };
         let place = |at: usize| (at % width - origin % width, at / width - origin / width);
         let mut known = [[None::<Lit>; TILE]; TILE];
+        if let Some(beside) = beside {
+            let mut all = true;
+            for &(at, ref path, _, hit) in seen {
+                let Some(hit) = hit else {
+                    continue;
+                };
+                let (column, row) = place(at);
+                let light = beside.light_at(&hit, &path.ray.at(hit.crossing.t));
+                known[row][column] = light;
+                match light {
+                    Some(light) => lit[at] = light,
+                    None => all = false,
+                }
+            }
+            if all {
+                return;
+            }
+        }
+        self.look_around(tile, seen);
+        let tile = &*tile;
         for step in [4, 2, 1] {
             // The coarsest lattice is centred in the tile.
             let phase = step / 4 * 2;

@@ -3,7 +3,8 @@
 //! left out, glass only dims it.
 //!
 //! In: a [`Scene`], a camera. Out: linear radiance, depth along the optical axis (metres), the object in every pixel.
-//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get two more for colour.
+//! One ray through each pixel's centre gives depth and object; edges and strong contrasts get more for colour. How
+//! much light a point gets does not depend on who looks: cameras side by side look for it once.
 
 mod light;
 mod shade;
@@ -12,7 +13,7 @@ mod tiles;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-pub use self::shade::refracted;
+pub use self::{light::LitView, shade::refracted};
 use self::{
     light::{Lit, UNLIT},
     shade::plus,
@@ -29,6 +30,10 @@ use crate::model::{camera::Intrinsics, pose::Pose};
 const LIFT: f64 = 1e-7;
 /// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
 const CONTRAST: f32 = 0.12;
+/// Where in such a pixel it is sampled again, besides its centre: five even steps both across and down, none off the
+/// middle. The first two do as well.
+const SAMPLES: [(f64, f64); 4] = [(0.4, -0.2), (-0.4, 0.2), (0.2, 0.4), (-0.2, -0.4)];
+
 /// A round lamp below the ceiling.
 #[derive(Debug, Clone)]
 pub struct Lamp {
@@ -111,6 +116,17 @@ struct Path {
     weight: f32,
 }
 
+/// What is known of the light on a ray's end before it is looked for.
+#[derive(Clone, Copy)]
+struct Near<'a> {
+    /// The light itself.
+    lit: Option<Lit>,
+    /// The light that a camera near by sees.
+    view: Option<&'a LitView>,
+    /// What may be in the light's way.
+    tile: Option<&'a Tile>,
+}
+
 /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
 pub fn camera_ray(camera: &Intrinsics, world_from_camera: &Pose, u: f64, v: f64) -> (Ray, f64) {
     let in_camera = camera.unproject(u, v, 1.0).coords;
@@ -131,6 +147,16 @@ fn twist_of(column: usize, row: usize) -> f64 {
 impl Tracer<'_> {
     /// Renders what a camera sees.
     pub fn render(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Rendering {
+        self.render_beside(camera, world_from_camera, None).0
+    }
+
+    /// Renders what a camera sees. The light on what the camera `beside` it, if any, sees as well is taken from there.
+    pub fn render_beside(
+        &self,
+        camera: &Intrinsics,
+        world_from_camera: &Pose,
+        beside: Option<&LitView>,
+    ) -> (Rendering, LitView) {
         let width = camera.width;
         let pixels = camera.pixels();
         let prints = self.footprints(camera, world_from_camera);
@@ -197,11 +223,14 @@ impl Tracer<'_> {
                                 seen.push((row * width + column, path, cos, hit));
                             }
                         }
-                        self.look_around(&mut tile, &seen);
-                        self.light(&tile, &seen, lit, width, scratch);
+                        self.light(&mut tile, &seen, beside, lit, width, scratch);
                         for (at, path, cos, hit) in seen {
-                            radiance[at] =
-                                self.shade(&path, hit.as_ref(), Some(lit[at]), None, scratch);
+                            let near = Near {
+                                lit: Some(lit[at]),
+                                view: beside,
+                                tile: None,
+                            };
+                            radiance[at] = self.shade(&path, hit.as_ref(), near, scratch);
                             let Some(hit) = hit else {
                                 continue;
                             };
@@ -225,13 +254,15 @@ impl Tracer<'_> {
             )
             .collect();
         let first = rendering.radiance.clone();
+        let view = LitView::new(lit, rendering.depth_m.clone(), *camera, world_from_camera);
+        let lit = &view.lit;
         rendering
             .radiance
             .par_chunks_mut(width)
             .enumerate()
             .for_each_init(Scratch::default, |scratch, (row, radiance)| {
                 for (column, radiance) in radiance.iter_mut().enumerate() {
-                    if !rough(camera, &rendering.object, &lit, &first, column, row) {
+                    if !rough(camera, &rendering.object, lit, &first, column, row) {
                         continue;
                     }
                     let here = row * width + column;
@@ -243,29 +274,46 @@ impl Tracer<'_> {
                         (row + 1 < camera.height).then_some(here + width),
                     ];
                     let tile = &bands[row / TILE][column / TILE];
-                    let mut sum = scaled(*radiance, 1.0 / 3.0);
-                    for (index, (du, dv)) in [(-0.34, 0.17), (0.17, -0.34)].into_iter().enumerate()
-                    {
+                    let clear = around
+                        .into_iter()
+                        .flatten()
+                        .all(|there| lit[there].face != UNLIT.face);
+                    // Glass is looked through again for every sample.
+                    let offsets = if clear { &SAMPLES[..] } else { &SAMPLES[..2] };
+                    let share = 1.0 / (offsets.len() + 1) as f32;
+                    let mut sum = scaled(*radiance, share);
+                    for (index, &(du, dv)) in offsets.iter().enumerate() {
                         let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
-                        let hit = self.first(&path.ray, tile);
+                        // Where there is no glass, what is seen here is seen at one of these pixels.
+                        let hit = if clear {
+                            self.first_of(&path.ray, around.map(|at| at.map(|at| lit[at].face.0)))
+                        } else {
+                            None
+                        }
+                        .or_else(|| self.first(&path.ray, tile));
                         // What the pixel or one beside it shows of the same face: its texture and light are averaged
-                        // over a pixel already, and do not differ much. Glass is looked through again.
+                        // over a pixel already, and do not differ much.
                         let known = hit.and_then(|hit| {
                             around.into_iter().flatten().find(|&there| {
                                 lit[there].face == (hit.primitive, hit.crossing.part)
                             })
                         });
+                        let near = Near {
+                            lit: None,
+                            view: Some(&view),
+                            tile: Some(tile),
+                        };
                         let colour = known.map_or_else(
-                            || self.shade(&path, hit.as_ref(), None, Some(tile), scratch),
+                            || self.shade(&path, hit.as_ref(), near, scratch),
                             |there| first[there],
                         );
-                        sum = plus(sum, scaled(colour, 1.0 / 3.0));
+                        sum = plus(sum, scaled(colour, share));
                     }
                     *radiance = sum;
                 }
             });
-        rendering
+        (rendering, view)
     }
 }
 

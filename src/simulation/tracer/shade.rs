@@ -2,9 +2,9 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::{LIFT, Path, Scratch, Tracer, light::Lit, tiles::Tile};
+use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit};
 use crate::simulation::{
-    scene::{Finish, Hit, Primitive},
+    scene::{Finish, Hit},
     shapes::Ray,
     texture::{Rgb, Spot, mixed, rgb, scaled},
 };
@@ -46,17 +46,17 @@ fn times(a: Rgb, b: Rgb) -> Rgb {
 }
 
 impl Tracer<'_> {
-    fn trace(&self, path: &Path, scratch: &mut Scratch) -> Rgb {
+    fn trace(&self, path: &Path, near: Near, scratch: &mut Scratch) -> Rgb {
         let hit = self.scene.nearest(&path.ray, LIFT, f64::INFINITY, |_| true);
-        self.shade(path, hit.as_ref(), None, None, scratch)
+        let near = Near { lit: None, ..near };
+        self.shade(path, hit.as_ref(), near, scratch)
     }
 
     pub(super) fn shade(
         &self,
         path: &Path,
         hit: Option<&Hit>,
-        lit: Option<Lit>,
-        tile: Option<&Tile>,
+        near: Near,
         scratch: &mut Scratch,
     ) -> Rgb {
         let Some(hit) = hit else {
@@ -64,10 +64,13 @@ impl Tracer<'_> {
         };
         let primitive = &self.scene.primitives()[hit.primitive];
         match primitive.material.finish {
-            Finish::Glass { index } => self.glass(path, hit, primitive, index, scratch),
+            Finish::Glass { index } => self.glass(path, hit, index, near, scratch),
             finish => {
-                let lit = lit.unwrap_or_else(|| self.light_on(path, hit, tile, scratch));
-                self.opaque(path, hit, primitive, finish, lit, scratch)
+                let lit = near
+                    .lit
+                    .or_else(|| near.view?.light_at(hit, &path.ray.at(hit.crossing.t)))
+                    .unwrap_or_else(|| self.light_on(path, hit, near.tile, scratch));
+                self.opaque(path, hit, finish, lit, near, scratch)
             }
         }
     }
@@ -98,14 +101,8 @@ impl Tracer<'_> {
         )
     }
 
-    fn glass(
-        &self,
-        path: &Path,
-        hit: &Hit,
-        primitive: &Primitive,
-        index: f64,
-        scratch: &mut Scratch,
-    ) -> Rgb {
+    fn glass(&self, path: &Path, hit: &Hit, index: f64, near: Near, scratch: &mut Scratch) -> Rgb {
+        let primitive = &self.scene.primitives()[hit.primitive];
         let direction = path.ray.direction;
         let point = path.ray.at(hit.crossing.t);
         let outward = primitive.shape.surface(&point, hit.crossing.part).normal
@@ -131,11 +128,11 @@ impl Tracer<'_> {
         };
         let reflection = mirrored(&direction, &normal);
         let Some(transmission) = refracted(&direction, &normal, ratio) else {
-            return self.trace(&onward(reflection, 1.0), scratch);
+            return self.trace(&onward(reflection, 1.0), near, scratch);
         };
         let share = fresnel(-direction.dot(&normal), -transmission.dot(&normal), ratio);
         let through = scaled(
-            self.trace(&onward(transmission, 1.0 - share), scratch),
+            self.trace(&onward(transmission, 1.0 - share), near, scratch),
             0.985 * (1.0 - share),
         );
         // Reflections inside the wall are many and faint: followed only where they are the view itself.
@@ -143,7 +140,7 @@ impl Tracer<'_> {
             return plus(through, scaled(self.surroundings(&reflection), share));
         }
         let reflected = plus(
-            self.trace(&onward(reflection, share), scratch),
+            self.trace(&onward(reflection, share), near, scratch),
             self.highlights(&point, &reflection, 0.08),
         );
         plus(through, scaled(reflected, share))
@@ -153,11 +150,12 @@ impl Tracer<'_> {
         &self,
         path: &Path,
         hit: &Hit,
-        primitive: &Primitive,
         finish: Finish,
         lit: Lit,
+        near: Near,
         scratch: &mut Scratch,
     ) -> Rgb {
+        let primitive = &self.scene.primitives()[hit.primitive];
         let direction = path.ray.direction;
         let point = path.ray.at(hit.crossing.t);
         let surface = primitive.shape.surface(&point, hit.crossing.part);
@@ -216,6 +214,7 @@ impl Tracer<'_> {
                     weight: path.weight * share,
                     ..*path
                 },
+                near,
                 scratch,
             )
         } else {

@@ -179,6 +179,33 @@ impl Tracer<'_> {
             .collect()
     }
 
+    /// The nearest hit of a ray with one of these primitives.
+    pub(super) fn first_of<const N: usize>(
+        &self,
+        ray: &Ray,
+        primitives: [Option<usize>; N],
+    ) -> Option<Hit> {
+        let mut best: Option<Hit> = None;
+        let mut t_max = f64::INFINITY;
+        for (index, primitive) in primitives.iter().enumerate() {
+            let Some(primitive) = *primitive else {
+                continue;
+            };
+            if primitives[..index].contains(&Some(primitive)) {
+                continue;
+            }
+            let shape = &self.scene.primitives()[primitive].shape;
+            if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
+                t_max = crossing.t;
+                best = Some(Hit {
+                    crossing,
+                    primitive,
+                });
+            }
+        }
+        best
+    }
+
     /// The nearest hit of a ray through the tile.
     pub(super) fn first(&self, ray: &Ray, tile: &Tile) -> Option<Hit> {
         let mut best: Option<Hit> = None;

@@ -1,6 +1,6 @@
 //! The interpolated beliefs of a whole image.
 
-use crate::model::belief::{Belief, CHANNELS};
+use crate::model::belief::{Belief, CHANNELS, rgb_from_ycbcr};
 
 /// Planes of a [`Prior`] row. Channels in the order Y, Cb, Cr.
 pub const ALPHA: usize = 0;
@@ -14,6 +14,9 @@ pub const DEPTH: usize = 14;
 /// How many views saw the pixel, outvoted ones included.
 pub const COVERAGE: usize = 15;
 pub const PLANES: usize = 16;
+
+/// What nobody saw is shown in a grey that stands back.
+const UNSEEN_RGB: [u8; 3] = [40, 40, 40];
 
 /// Row after row, each a run of [`PLANES`] planes of `width` values: a pass over a row touches 16 short streams, and
 /// rows can be shared out among threads.
@@ -60,6 +63,15 @@ impl<'a> PriorRow<'a> {
     #[inline(always)]
     pub fn plane(&self, plane: usize) -> &'a [f32] {
         &self.data[plane * self.width..][..self.width]
+    }
+
+    /// What is expected, for people.
+    pub fn expected_rgb(&self, x: usize) -> [u8; 3] {
+        if self.plane(COVERAGE)[x] > 0.0 {
+            rgb_from_ycbcr([TAU, TAU + 1, TAU + 2].map(|plane| self.plane(plane)[x]))
+        } else {
+            UNSEEN_RGB
+        }
     }
 
     #[inline(always)]

@@ -1,0 +1,566 @@
+//! What `/metrics` tells, in OpenMetrics. Counts that a place publishes about itself are read from there; the rest is
+//! counted here. Labels are bounded: at most 16 places, fixed sets of reasons, stages and outcomes, and no robots.
+
+use std::{
+    fmt,
+    sync::{Arc, Weak, atomic::Ordering},
+    time::{Duration, Instant},
+};
+
+use prometheus_client::{
+    collector::Collector,
+    encoding::{DescriptorEncoder, EncodeLabelSet, EncodeMetric, MetricEncoder, text},
+    metrics::{
+        MetricType,
+        counter::{ConstCounter, Counter},
+        family::Family,
+        gauge::{ConstGauge, Gauge},
+        histogram::{Histogram, exponential_buckets},
+        info::Info,
+    },
+    registry::{Registry, Unit},
+};
+
+use super::{inbox::Depths, ingest::IngestCounters, places::Places, status::PlaceTotals};
+use crate::pipeline::Stage;
+
+/// Half a millisecond to a second: from a stage of a small image to depth from three cameras.
+fn seconds() -> Histogram {
+    Histogram::new(exponential_buckets(0.0005, 2.0, 12))
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfPlace {
+    place: String,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfStage {
+    place: String,
+    stage: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfQuery {
+    kind: &'static str,
+    outcome: &'static str,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfEvent {
+    place: String,
+    kind: String,
+    state: String,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Hash, EncodeLabelSet)]
+struct OfStatus {
+    status: &'static str,
+}
+
+type Histograms<L> = Family<L, Histogram, fn() -> Histogram>;
+
+/// Counted where it happens.
+#[derive(Debug, Clone)]
+pub struct Metrics {
+    stages: Histograms<OfStage>,
+    frames: Histograms<OfPlace>,
+    queries: Family<OfQuery, Counter>,
+    events: Family<OfEvent, Counter>,
+    responses: Family<OfStatus, Counter>,
+    pub sse_clients: Gauge,
+    /// Messages that a client was too slow for.
+    pub sse_lagged: Counter,
+    pub sse_refused: Counter,
+    pub unauthorized: Counter,
+    /// What the workers had to say to the watchers and nobody took in time.
+    pub news_dropped: Counter,
+}
+
+impl Default for Metrics {
+    fn default() -> Self {
+        Self {
+            stages: Family::new_with_constructor(seconds),
+            frames: Family::new_with_constructor(seconds),
+            queries: Family::default(),
+            events: Family::default(),
+            responses: Family::default(),
+            sse_clients: Gauge::default(),
+            sse_lagged: Counter::default(),
+            sse_refused: Counter::default(),
+            unauthorized: Counter::default(),
+            news_dropped: Counter::default(),
+        }
+    }
+}
+
+impl Metrics {
+    /// `outcome`: ok, or a refusal's code.
+    pub fn query(&self, kind: &'static str, outcome: &'static str) {
+        self.queries.get_or_create(&OfQuery { kind, outcome }).inc();
+    }
+
+    pub fn event(&self, place: &str, kind: &str, state: &str) {
+        let labels = OfEvent {
+            place: place.to_owned(),
+            kind: kind.to_owned(),
+            state: state.to_owned(),
+        };
+        self.events.get_or_create(&labels).inc();
+    }
+
+    /// An answer over HTTP, by its status.
+    pub fn response(&self, status: u16) {
+        let status = match status {
+            0..300 => "2xx",
+            300..400 => "3xx",
+            400..500 => "4xx",
+            _ => "5xx",
+        };
+        self.responses.get_or_create(&OfStatus { status }).inc();
+    }
+
+    pub fn stopwatches(&self, place: &str) -> Stopwatches {
+        let stage = |stage| {
+            self.stages.get_or_create_owned(&OfStage {
+                place: place.to_owned(),
+                stage,
+            })
+        };
+        Stopwatches {
+            decode: stage("decode"),
+            depth: stage("depth"),
+            refine: stage("refine"),
+            compare: stage("compare"),
+            attend: stage("attend"),
+            remember: stage("remember"),
+            publish: stage("publish"),
+            frame: self.frames.get_or_create_owned(&OfPlace {
+                place: place.to_owned(),
+            }),
+        }
+    }
+
+    /// Everything, ready to be asked. `places` is not kept alive.
+    pub fn registry(&self, places: &Arc<Places>, counters: Arc<IngestCounters>) -> Registry {
+        let mut registry = Registry::with_prefix("surprised");
+        registry.register(
+            "build",
+            "The version that runs",
+            Info::new([("version", env!("CARGO_PKG_VERSION"))]),
+        );
+        registry.register_with_unit(
+            "stage",
+            "Time of the parts of a frame's way",
+            Unit::Seconds,
+            self.stages.clone(),
+        );
+        registry.register_with_unit(
+            "frame",
+            "From a frame's arrival until its report is published",
+            Unit::Seconds,
+            self.frames.clone(),
+        );
+        registry.register(
+            "queries",
+            "Questions to the memory, over Zenoh and HTTP, by what came of them",
+            self.queries.clone(),
+        );
+        registry.register("events", "Events told of", self.events.clone());
+        registry.register(
+            "http_responses",
+            "Answers over HTTP, without those of /events that go on",
+            self.responses.clone(),
+        );
+        registry.register(
+            "http_unauthorized",
+            "Requests without the token",
+            self.unauthorized.clone(),
+        );
+        registry.register(
+            "sse_clients",
+            "Open connections to /events",
+            self.sse_clients.clone(),
+        );
+        registry.register(
+            "sse_lagged",
+            "Messages of /events that a client was too slow for",
+            self.sse_lagged.clone(),
+        );
+        registry.register(
+            "sse_refused",
+            "Connections to /events that were too many",
+            self.sse_refused.clone(),
+        );
+        registry.register(
+            "news_dropped",
+            "What watchers were not told because too much happened at once",
+            self.news_dropped.clone(),
+        );
+        registry.register_collector(Box::new(OfPlaces {
+            places: Arc::downgrade(places),
+            counters,
+        }));
+        registry
+    }
+}
+
+/// The histograms of one place.
+#[derive(Debug, Clone)]
+pub struct Stopwatches {
+    decode: Histogram,
+    depth: Histogram,
+    refine: Histogram,
+    compare: Histogram,
+    attend: Histogram,
+    remember: Histogram,
+    publish: Histogram,
+    frame: Histogram,
+}
+
+/// One frame's way, timed where the clock is: outside of the pipeline.
+#[derive(Debug)]
+pub struct Stopwatch<'a> {
+    watches: &'a Stopwatches,
+    started: Instant,
+    lap: Instant,
+}
+
+impl Stopwatches {
+    pub fn start(&self) -> Stopwatch<'_> {
+        let now = Instant::now();
+        Stopwatch {
+            watches: self,
+            started: now,
+            lap: now,
+        }
+    }
+}
+
+impl Stopwatch<'_> {
+    fn lap(&mut self, histogram: &Histogram) {
+        let now = Instant::now();
+        histogram.observe((now - self.lap).as_secs_f64());
+        self.lap = now;
+    }
+
+    pub fn decoded(&mut self) {
+        self.lap(&self.watches.decode);
+    }
+
+    pub fn ended(&mut self, stage: Stage) {
+        let watches = self.watches;
+        self.lap(match stage {
+            Stage::Depth => &watches.depth,
+            Stage::Refine => &watches.refine,
+            Stage::Compare => &watches.compare,
+            Stage::Attend => &watches.attend,
+            Stage::Remember => &watches.remember,
+        });
+    }
+
+    /// Of a frame that came then.
+    pub fn published(&mut self, arrived: Instant) {
+        self.lap(&self.watches.publish);
+        self.watches
+            .frame
+            .observe((self.lap - arrived).as_secs_f64());
+    }
+
+    pub fn elapsed(&self) -> Duration {
+        self.started.elapsed()
+    }
+}
+
+/// The text of a registry.
+pub fn text(registry: &Registry) -> String {
+    let mut text = String::new();
+    text::encode(&mut text, registry).expect("writing to memory does not fail");
+    text
+}
+
+/// Reads what the places publish when it is asked.
+struct OfPlaces {
+    places: Weak<Places>,
+    counters: Arc<IngestCounters>,
+}
+
+impl fmt::Debug for OfPlaces {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("OfPlaces")
+    }
+}
+
+/// A place at the time of asking.
+struct Seen {
+    totals: PlaceTotals,
+    cameras: usize,
+    live: usize,
+    depths: Depths,
+}
+
+impl Collector for OfPlaces {
+    fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
+        let Some(places) = self.places.upgrade() else {
+            return Ok(());
+        };
+        let seen: Vec<Seen> = places
+            .all()
+            .into_iter()
+            .map(|(_, place)| {
+                let status = place.status.borrow();
+                Seen {
+                    totals: status.totals.clone(),
+                    cameras: status.cameras.len(),
+                    live: status.cameras.iter().filter(|camera| camera.live).count(),
+                    depths: place.inbox.depths(),
+                }
+            })
+            .collect();
+        let mut out = Out {
+            encoder: &mut encoder,
+            seen: &seen,
+        };
+        out.counters("frames_received", "Frames that came", |place| {
+            place.totals.inbox.frames_received
+        })?;
+        out.counters("received_bytes", "Bytes of the frames that came", |place| {
+            place.totals.inbox.bytes_received
+        })?;
+        out.counters("frames_processed", "Frames with a report", |place| {
+            place.totals.frames
+        })?;
+        out.labelled(
+            "frames_dropped",
+            "Frames that a newer one replaced, or that never came",
+            "reason",
+            |place| {
+                vec![
+                    ("replaced", place.totals.inbox.frames_replaced),
+                    ("lost", place.totals.frames_lost),
+                ]
+            },
+        )?;
+        out.labelled(
+            "frames_rejected",
+            "Frames and what comes beside them, refused",
+            "reason",
+            |place| {
+                let by = place.totals.refused_by.iter();
+                by.map(|(code, count)| (*code, *count)).collect()
+            },
+        )?;
+        out.counters(
+            "poses_dropped",
+            "Poses and markers that were too many",
+            |place| place.totals.inbox.poses_dropped,
+        )?;
+        out.gauges("cameras", "Cameras heard of", |place| place.cameras as i64)?;
+        out.gauges("cameras_live", "Cameras that say they are there", |place| {
+            place.live as i64
+        })?;
+        out.gauges("viewpoints", "Viewpoints held", |place| {
+            place.totals.viewpoints as i64
+        })?;
+        out.gauges("memory_bytes", "Bytes of the viewpoints", |place| {
+            place.totals.memory_bytes as i64
+        })?;
+        out.gauges("memory_max_bytes", "Their budget", |place| {
+            place.totals.memory_bytes_max as i64
+        })?;
+        out.counters(
+            "viewpoints_replaced_for_room",
+            "Viewpoints forgotten because the memory was full",
+            |place| place.totals.replaced_for_room,
+        )?;
+        out.counters(
+            "ask_passes",
+            "Passes of the engine that questions have taken",
+            |place| place.totals.ask_passes,
+        )?;
+        out.gauges("events_open", "Events that last", |place| {
+            place.totals.open_events as i64
+        })?;
+        out.queues()?;
+        out.engines()?;
+        out.service(&self.counters)
+    }
+}
+
+struct Out<'a, 'b> {
+    encoder: &'a mut DescriptorEncoder<'b>,
+    seen: &'a [Seen],
+}
+
+impl Out<'_, '_> {
+    fn metric(
+        &mut self,
+        name: &str,
+        help: &str,
+        kind: MetricType,
+        write: impl FnOnce(&mut MetricEncoder, &[Seen]) -> fmt::Result,
+    ) -> fmt::Result {
+        let name = format!("surprised_{name}");
+        let mut encoder = self.encoder.encode_descriptor(&name, help, None, kind)?;
+        write(&mut encoder, self.seen)
+    }
+
+    fn counters(&mut self, name: &str, help: &str, of: impl Fn(&Seen) -> u64) -> fmt::Result {
+        self.metric(name, help, MetricType::Counter, |encoder, seen| {
+            for place in seen {
+                let labels = [("place", place.totals.place.as_str())];
+                ConstCounter::new(of(place)).encode(encoder.encode_family(&labels)?)?;
+            }
+            Ok(())
+        })
+    }
+
+    fn gauges(&mut self, name: &str, help: &str, of: impl Fn(&Seen) -> i64) -> fmt::Result {
+        self.metric(name, help, MetricType::Gauge, |encoder, seen| {
+            for place in seen {
+                let labels = [("place", place.totals.place.as_str())];
+                ConstGauge::new(of(place)).encode(encoder.encode_family(&labels)?)?;
+            }
+            Ok(())
+        })
+    }
+
+    fn labelled(
+        &mut self,
+        name: &str,
+        help: &str,
+        label: &'static str,
+        of: impl Fn(&Seen) -> Vec<(&'static str, u64)>,
+    ) -> fmt::Result {
+        self.metric(name, help, MetricType::Counter, |encoder, seen| {
+            for place in seen {
+                for (value, count) in of(place) {
+                    let labels = [("place", place.totals.place.as_str()), (label, value)];
+                    ConstCounter::new(count).encode(encoder.encode_family(&labels)?)?;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    fn queues(&mut self) -> fmt::Result {
+        let help = "What waits for a place's worker";
+        self.metric("queue_depth", help, MetricType::Gauge, |encoder, seen| {
+            for place in seen {
+                let Depths {
+                    frames,
+                    poses,
+                    asks,
+                } = place.depths;
+                for (queue, depth) in [("frames", frames), ("poses", poses), ("asks", asks)] {
+                    let labels = [("place", place.totals.place.as_str()), ("queue", queue)];
+                    ConstGauge::new(depth as i64).encode(encoder.encode_family(&labels)?)?;
+                }
+            }
+            Ok(())
+        })
+    }
+
+    /// What computes, and what a graphics card's engine has moved.
+    fn engines(&mut self) -> fmt::Result {
+        let help = "What computes: 1 for the one in use";
+        self.metric("engine", help, MetricType::Gauge, |encoder, seen| {
+            for place in seen.iter().filter(|place| !place.totals.engine.is_empty()) {
+                let labels = [
+                    ("place", place.totals.place.as_str()),
+                    ("engine", place.totals.engine.as_str()),
+                ];
+                ConstGauge::new(1i64).encode(encoder.encode_family(&labels)?)?;
+            }
+            Ok(())
+        })?;
+        if self.seen.iter().all(|place| place.totals.gpu.is_none()) {
+            return Ok(());
+        }
+        let gpu = |place: &Seen| place.totals.gpu.clone().unwrap_or_default();
+        self.counters("gpu_frames", "Frames computed on the card", |place| {
+            gpu(place).frames
+        })?;
+        self.counters(
+            "gpu_on_processor",
+            "Frames and recalls that the processor did because the card could not",
+            |place| gpu(place).on_processor,
+        )?;
+        self.counters("gpu_uploaded_bytes", "Bytes moved to the card", |place| {
+            gpu(place).uploaded_bytes
+        })?;
+        self.counters("gpu_read_back_bytes", "Bytes moved back", |place| {
+            gpu(place).read_back_bytes
+        })?;
+        self.counters(
+            "gpu_residency_misses",
+            "Viewpoints that were wanted and not on the card",
+            |place| gpu(place).views_brought,
+        )?;
+        self.counters(
+            "gpu_residency_evictions",
+            "Viewpoints that made room on the card",
+            |place| gpu(place).evicted,
+        )?;
+        self.gauges(
+            "gpu_resident_bytes",
+            "Bytes of viewpoints on the card",
+            |place| gpu(place).resident_bytes as i64,
+        )?;
+        self.counters("gpu_losses", "Cards lost and replaced", |place| {
+            gpu(place).losses
+        })?;
+        let help = "Time of the last frame's passes, where the card can tell";
+        self.metric(
+            "gpu_pass_seconds",
+            help,
+            MetricType::Gauge,
+            |encoder, seen| {
+                for place in seen {
+                    for (pass, seconds) in gpu(place).pass_seconds {
+                        let labels = [("place", place.totals.place.as_str()), ("pass", pass)];
+                        ConstGauge::new(seconds).encode(encoder.encode_family(&labels)?)?;
+                    }
+                }
+                Ok(())
+            },
+        )
+    }
+
+    fn service(&mut self, counters: &IngestCounters) -> fmt::Result {
+        let counts = [
+            (
+                "bad_keys",
+                "Samples on keys that name no camera",
+                &counters.bad_keys,
+            ),
+            (
+                "refused_at_the_door",
+                "Samples refused because there are too many places or cameras",
+                &counters.refused,
+            ),
+            (
+                "questions_busy",
+                "Questions refused because too many bytes of them were under way",
+                &counters.questions_busy,
+            ),
+            (
+                "questions_late",
+                "Questions that had no answer in time",
+                &counters.questions_late,
+            ),
+            (
+                "queries_dropped",
+                "Queries that found their queue full",
+                &counters.queries_dropped,
+            ),
+        ];
+        for (name, help, count) in counts {
+            self.metric(name, help, MetricType::Counter, |encoder, _| {
+                let count = count.load(Ordering::Relaxed);
+                ConstCounter::new(count).encode(encoder.encode_family(&[("", ""); 0])?)
+            })?;
+        }
+        Ok(())
+    }
+}

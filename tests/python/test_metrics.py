@@ -1,0 +1,96 @@
+"""What Prometheus scrapes: read by Prometheus' own parser, and true."""
+
+import pytest
+import scene
+from daemon import ask, prior_request, refusal
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
+from surprised_proto import PriorRequest
+
+
+@pytest.fixture
+def scrape(daemon):
+    def scrape():
+        status, content_type, body = daemon.fetch("/metrics")
+        assert status == 200 and content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
+        return {family.name: family for family in text_string_to_metric_families(body.decode())}
+
+    return scrape
+
+
+def value(families, sample: str, **labels) -> float:
+    found = [
+        each.value
+        for family in families.values()
+        for each in family.samples
+        if each.name == sample and each.labels == labels
+    ]
+    assert len(found) == 1, f"{len(found)} of {sample} {labels}"
+    return found[0]
+
+
+def test_frames_are_counted_by_what_became_of_them(scrape, place, settled):
+    settled.put(b"no frame at all")
+    settled.expect_rejection()
+    families = scrape()
+    assert value(families, "surprised_frames_received_total", place=place) == 9
+    assert value(families, "surprised_frames_processed_total", place=place) == 8
+    assert value(families, "surprised_frames_rejected_total", place=place, reason="undecodable") == 1
+    assert value(families, "surprised_frames_dropped_total", place=place, reason="replaced") == 0
+    assert value(families, "surprised_received_bytes_total", place=place) > 8 * scene.WIDTH * scene.HEIGHT * 7
+    assert value(families, "surprised_viewpoints", place=place) >= 1
+    assert 0 < value(families, "surprised_memory_bytes", place=place) < value(
+        families, "surprised_memory_max_bytes", place=place
+    )
+    assert value(families, "surprised_cameras", place=place) == 1
+
+
+def test_lost_frames_are_counted(scrape, place, settled):
+    settled.sequence += 5
+    settled.show()
+    assert value(scrape(), "surprised_frames_dropped_total", place=place, reason="lost") == 5
+
+
+def test_every_part_of_a_frames_way_is_timed(scrape, place, settled):
+    families = scrape()
+    parts = 0.0
+    for stage in ("decode", "depth", "refine", "compare", "attend", "remember", "publish"):
+        assert value(families, "surprised_stage_seconds_count", place=place, stage=stage) == 8
+        parts += value(families, "surprised_stage_seconds_sum", place=place, stage=stage)
+    assert value(families, "surprised_frame_seconds_count", place=place) == 8
+    assert value(families, "surprised_frame_seconds_sum", place=place) >= parts > 0
+    assert value(families, "surprised_frame_seconds_bucket", place=place, le="+Inf") == 8
+
+
+def test_queries_are_counted_by_kind_and_outcome(scrape, session, place, settled):
+    def count(kind, outcome):
+        return sum(
+            sample.value
+            for sample in scrape()["surprised_queries"].samples
+            if sample.labels == {"kind": kind, "outcome": outcome}
+        )
+
+    before = count("prior", "ok")
+    ask(session, f"surprised/{place}/@memory/prior", prior_request())
+    assert count("prior", "ok") == before + 1
+    assert "pose" in refusal(session, f"surprised/{place}/@memory/prior", PriorRequest())
+    assert count("prior", "bad_request") >= 1
+
+
+def test_events_and_the_engine_are_told(scrape, place, settled):
+    for _ in range(2):
+        settled.show(scene.BOX)
+    families = scrape()
+    assert value(families, "surprised_events_total", place=place, kind="change", state="new") == 1
+    assert value(families, "surprised_events_open", place=place) >= 1
+    engines = [sample for sample in families["surprised_engine"].samples if sample.labels["place"] == place]
+    assert len(engines) == 1 and engines[0].labels["engine"] and engines[0].value == 1
+    for queue in ("frames", "poses", "asks"):
+        assert value(families, "surprised_queue_depth", place=place, queue=queue) == 0
+    assert families["surprised_build"].samples[0].labels["version"]
+
+
+def test_no_label_grows_with_robots(scrape, settled):
+    labels = {label for family in scrape().values() for sample in family.samples for label in sample.labels}
+    assert labels <= {
+        "place", "reason", "stage", "le", "kind", "outcome", "state", "status", "queue", "engine", "version", "pass",
+    }  # fmt: skip
