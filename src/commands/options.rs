@@ -5,6 +5,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use crate::{
     config::{ConfigError, Preset, Settings},
     engine::EngineKind,
+    memory::store::{Store, StoreError},
     service::{self, session::ZenohOptions},
 };
 
@@ -48,6 +49,10 @@ pub struct ServiceOptions {
     /// Where recall and surprise are computed.
     #[arg(long, value_enum, default_value_t)]
     pub engine: EngineKind,
+    /// Where memories last: file:///folder, s3://bucket/prefix with the usual AWS_ variables, or memory:// for memories
+    /// that end with the program. Without it serve keeps them in this user's data folder, and demo nowhere.
+    #[arg(long, value_name = "URL")]
+    pub memory: Option<String>,
     /// Address to serve HTTP on; off for none.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", value_parser = http)]
     pub http: Http,
@@ -60,10 +65,17 @@ pub struct ServiceOptions {
 
 impl ServiceOptions {
     /// # Errors
-    /// Settings that are wrong.
-    pub fn options(self) -> Result<service::Options, ConfigError> {
+    /// Settings that are wrong, or a memory that cannot be opened.
+    pub fn options(self, lasting: bool) -> Result<service::Options, ConfigError> {
+        let settings = self.settings.settings()?;
+        let memory = |error: StoreError| ConfigError::Memory(error.to_string());
         Ok(service::Options {
-            settings: self.settings.settings()?,
+            settings,
+            store: match self.memory {
+                Some(url) => Store::open(&url).map_err(memory)?,
+                None if lasting => Some(Store::in_data_folder().map_err(memory)?),
+                None => None,
+            },
             engine: self.engine,
             root: self.root,
             http: self.http.0,

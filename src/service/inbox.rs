@@ -84,6 +84,8 @@ struct State {
     asks_busy: u64,
     /// A camera came or went.
     live_changed: bool,
+    /// The stored memory has news.
+    memory_news: bool,
     closed: bool,
 }
 
@@ -102,6 +104,8 @@ pub struct Delivery {
     pub frames: Vec<Source>,
     /// A camera came or went.
     pub live_changed: bool,
+    /// The stored memory has news.
+    pub memory_news: bool,
     pub closed: bool,
 }
 
@@ -192,6 +196,12 @@ impl Inbox {
         drop(state);
         self.wake.notify_one();
         Ok(())
+    }
+
+    /// Says that the stored memory has news.
+    pub fn put_memory_news(&self) {
+        self.lock().memory_news = true;
+        self.wake.notify_one();
     }
 
     pub fn close(&self) {
@@ -297,6 +307,7 @@ impl State {
         let mut delivery = Delivery {
             asks: self.asks.drain(..).collect(),
             live_changed: std::mem::take(&mut self.live_changed),
+            memory_news: std::mem::take(&mut self.memory_news),
             closed: self.closed,
             ..Delivery::default()
         };
@@ -324,6 +335,7 @@ impl Delivery {
             && self.asks.is_empty()
             && self.frames.is_empty()
             && !self.live_changed
+            && !self.memory_news
             && !self.closed
     }
 }

@@ -8,7 +8,10 @@ use std::{
 };
 
 use rayon::ThreadPool;
-use tokio::sync::{mpsc, watch};
+use tokio::{
+    runtime::Handle,
+    sync::{mpsc, watch},
+};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use super::{inbox::Inbox, ingest, status::PlaceStatus, worker::Worker};
@@ -16,6 +19,7 @@ use crate::{
     config::Settings,
     engine::{Engine, EngineKind},
     isa::Isa,
+    memory::store::{PlaceOptions, PlaceStore, Store},
     model::refusal::Refusal,
     pipeline::Pipeline,
     wire::keys,
@@ -35,6 +39,9 @@ pub struct Place {
 
 pub struct Places {
     pub settings: Settings,
+    /// Where memories last; `None`: they end with the service.
+    pub store: Option<Store>,
+    runtime: Handle,
     engine: EngineKind,
     pub root: Arc<str>,
     pub session: Session,
@@ -55,8 +62,10 @@ struct Running {
 pub type Starts = mpsc::Receiver<Arc<str>>;
 
 impl Places {
+    /// On a tokio runtime.
     pub fn new(
         settings: Settings,
+        store: Option<Store>,
         engine: EngineKind,
         root: Arc<str>,
         session: Session,
@@ -66,6 +75,8 @@ impl Places {
         let (starts, started) = mpsc::channel(PLACES_MAX);
         let places = Self {
             settings,
+            store,
+            runtime: Handle::current(),
             engine,
             root,
             session,
@@ -158,7 +169,15 @@ impl Places {
         let isa = Isa::detect();
         let engine = Engine::new(self.engine, &self.settings, self.pool.clone(), isa)?;
         let pipeline = Pipeline::with_engine(self.settings.clone(), self.pool.clone(), isa, engine);
+        let memory = self.store.as_ref().map(|store| {
+            let inbox = place.inbox.clone();
+            let options = PlaceOptions::new(&self.settings);
+            PlaceStore::open(store, name, options, &self.runtime, move || {
+                inbox.put_memory_news();
+            })
+        });
         let worker = Worker {
+            memory,
             place: name.clone(),
             root: self.root.clone(),
             session: self.session.clone(),

@@ -5,18 +5,25 @@ use std::{collections::BTreeMap, sync::Arc};
 use serde::Serialize;
 
 use super::inbox::SlotCounters;
-use crate::wire::proto;
+use crate::{memory::store::StoreStatus, wire::proto};
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct PlaceStatus {
     pub place: String,
     pub frames: u64,
     pub refused: u64,
+    /// In RAM.
     pub viewpoints: usize,
     pub memory_bytes: usize,
     pub memory_bytes_max: usize,
     /// Viewpoints forgotten because the memory was full.
     pub replaced_for_room: u64,
+    /// Viewpoints that are known, in RAM or only stored.
+    pub viewpoints_known: usize,
+    /// Viewpoints that left RAM because others were needed there.
+    pub evicted: u64,
+    /// `None`: the memory ends with the service.
+    pub store: Option<StoreStatus>,
     pub asks_answered: u64,
     /// Asks refused because the queue was full.
     pub asks_busy: u64,

@@ -17,6 +17,7 @@ use super::{
     status::PlaceStatus,
 };
 use crate::{
+    memory::store::PlaceStore,
     model::{
         frame::{RgbImage, Source},
         pose::{Pose, PoseNoise},
@@ -34,12 +35,19 @@ use crate::{
 /// How long a closing worker goes on with frames that have already come.
 const FINISH_WITHIN: Duration = Duration::from_secs(2);
 
+/// How long a starting worker waits for what is stored of its place.
+const READ_WITHIN: Duration = Duration::from_secs(3);
+/// How long a closing worker waits until everything is stored.
+const STORE_WITHIN: Duration = Duration::from_secs(2);
+
 pub struct Worker {
     pub place: Arc<str>,
     pub root: Arc<str>,
     pub session: zenoh::Session,
     pub inbox: Arc<Inbox>,
     pub pipeline: Pipeline,
+    /// Where the place's memory lasts.
+    pub memory: Option<PlaceStore>,
     pub status: watch::Sender<Arc<PlaceStatus>>,
     /// Asks a robot for its calibration; the answer comes through the inbox.
     pub ask_calibration: Box<dyn Fn(&CameraPath) + Send>,
@@ -75,6 +83,11 @@ impl Worker {
             asks_answered: 0,
             worker: self,
         };
+        if let Some(memory) = &desk.worker.memory {
+            // Most stores answer at once; frames of the others are refused with the reason.
+            memory.wait_read(READ_WITHIN);
+        }
+        desk.sync_memory();
         desk.publish_status();
         let mut wake = None;
         let mut finish_by = None;
@@ -97,6 +110,7 @@ impl Worker {
             for source in delivery.frames {
                 desk.receive(&source);
             }
+            desk.sync_memory();
             desk.fit_markers();
             let next = desk.turn();
             wake = next.wake;
@@ -104,6 +118,12 @@ impl Worker {
             if let Some(finish_by) = finish_by
                 && (!next.served || Instant::now() >= finish_by)
             {
+                let Worker {
+                    memory, pipeline, ..
+                } = &mut desk.worker;
+                if let Some(memory) = memory {
+                    memory.close(pipeline.memory_mut(), STORE_WITHIN);
+                }
                 return;
             }
         }
@@ -264,11 +284,25 @@ impl Desk {
         };
         let lenses = camera.lenses(packed.calibration.as_ref(), limits)?;
         let frame = unpack(packed, &lenses, source.clone(), pose, noise, limits)?;
-        let pipeline = &mut self.worker.pipeline;
+        let Worker {
+            place,
+            pipeline,
+            memory,
+            ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.may_learn()?;
+            memory.bring(pipeline.memory_mut(), &pose);
+        }
         let report = pipeline.process(&frame)?;
+        if let Some(memory) = memory {
+            let held = pipeline.memory_mut();
+            memory.sync(held);
+            memory.prefetch(held, source, (frame.stamp_ns, report.world_from_camera));
+        }
         let processing_seconds = started.elapsed().as_secs_f64();
         self.maps_of = Some(source.clone());
-        let message = encode::report(&report, &self.worker.place, processing_seconds);
+        let message = encode::report(&report, place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
         camera.processed(frame.image, lenses, message, frame.stamp_ns);
@@ -276,6 +310,26 @@ impl Desk {
             camera.show(|image| snapshot(pipeline, image));
         }
         Ok(())
+    }
+
+    /// Learns what is new about the stored memory.
+    fn sync_memory(&mut self) {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.sync(pipeline.memory_mut());
+        }
+    }
+
+    /// Has in RAM what is stored around a pose.
+    fn bring(&mut self, world_from_camera: &Pose) {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.bring(pipeline.memory_mut(), world_from_camera);
+        }
     }
 
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
@@ -312,6 +366,7 @@ impl Desk {
                 answer,
             } => {
                 if !answer.is_closed() {
+                    self.bring(&world_from_camera);
                     let prior = self.worker.pipeline.prior(&intrinsics, &world_from_camera);
                     drop(answer.send(Ok(encode::prior_reply(&prior, &planes))));
                 }
@@ -326,9 +381,9 @@ impl Desk {
                 }
             }
             Ask::Views { answer } => {
-                let views = self.worker.pipeline.memory().viewpoints().iter();
+                let views = self.worker.pipeline.memory().heads();
                 drop(answer.send(Ok(proto::ViewsReply {
-                    views: views.map(encode::view).collect(),
+                    views: views.iter().map(encode::view).collect(),
                 })));
             }
             Ask::Snapshot { camera, answer } => {
@@ -376,6 +431,7 @@ impl Desk {
         )?;
         // The maps are of the evaluated frame from here on.
         self.maps_of = None;
+        self.bring(&frame.world_from_camera);
         let report = self.worker.pipeline.evaluate(&frame)?;
         let seconds = started.elapsed().as_secs_f64();
         Ok(proto::EvaluateReply {
@@ -411,6 +467,9 @@ impl Desk {
             frames: self.frames,
             refused: cameras.iter().map(|camera| camera.refusals()).sum(),
             viewpoints: memory.viewpoints().len(),
+            viewpoints_known: memory.known(),
+            evicted: memory.evicted(),
+            store: self.worker.memory.as_ref().map(PlaceStore::status),
             memory_bytes: memory.bytes(),
             memory_bytes_max: pipeline.settings().memory_bytes,
             replaced_for_room: memory.replaced_for_room(),

@@ -15,7 +15,7 @@ use crate::{
         pose::Pose,
         refusal::Refusal,
         report::{Region, Report},
-        viewpoint::Viewpoint,
+        viewpoint::Head,
     },
     pipeline::{Maps, PriorAt},
     stages::interpolate::prior::{self, Prior},
@@ -351,7 +351,7 @@ fn covered(prior: &Prior) -> f32 {
     seen.count() as f32 / (prior.width * prior.height).max(1) as f32
 }
 
-pub fn view(viewpoint: &Viewpoint) -> proto::View {
+pub fn view(viewpoint: &Head) -> proto::View {
     proto::View {
         id: viewpoint.id,
         world_from_camera: Some(pose(&viewpoint.world_from_camera)),
