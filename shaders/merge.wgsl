@@ -4,6 +4,8 @@ const COLOUR_CONFLICT: f32 = 40.0;
 const COLOUR_TOLERANCE: f32 = 40.0;
 const COLOUR_CAP: f32 = 80.0;
 const P2_MAX: f32 = 0.95;
+const SETTLED_WEIGHT: f32 = 0.5;
+const P2_REPLACED: f32 = 0.49;
 
 /// A record interpolated inside its triangle.
 struct Gathered {
@@ -21,6 +23,20 @@ var<private> fresh: u32;
 var<private> depth_m: array<f32, VIEWS_MAX>;
 var<private> weight: array<f32, VIEWS_MAX>;
 var<private> gathered: array<Gathered, VIEWS_MAX>;
+
+/// Notes what a view says of this thread's pixel.
+fn push(pixel_depth_m: f32, said: Gathered, view: View) {
+    depth_m[count] = pixel_depth_m;
+    weight[count] = view.weight;
+    fresh |= view.fresh << count;
+    gathered[count] = said;
+    let unsettled = rules.earlier_appearance != 0u && view.fresh != 0u && view.weight < SETTLED_WEIGHT;
+    if unsettled && said.p2 >= P2_REPLACED {
+        gathered[count].tau = said.tau2;
+        gathered[count].p2 = 0.0;
+    }
+    count += 1u;
+}
 
 fn is_member(views_set: u32, index: u32) -> bool {
     return ((views_set >> index) & 1u) != 0u;

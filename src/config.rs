@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::model::pose::PoseNoise;
+use crate::model::{mode::Mode, pose::PoseNoise};
 
 /// Which defaults.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -54,6 +54,7 @@ pub enum Evidence {
 pub struct RobotSettings {
     pub pose_position_sd_m: Option<f64>,
     pub pose_rotation_sd_rad: Option<f64>,
+    pub mode: Option<Mode>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -147,6 +148,8 @@ pub struct Settings {
     /// Nearest and farthest of them, metres. What is nearer is taken for something else; a far end of 1e6 is infinity.
     pub depth_near_m: f64,
     pub depth_far_m: f64,
+    /// What a camera's frames do to the memory until somebody says otherwise: `learn`, `observe` or `freeze`.
+    pub mode: Mode,
     /// How long a frame without a pose waits for one from the `pose` or `markers` key, seconds.
     pub pose_wait_s: f64,
     /// Pull mode: how often the service gets each robot's `frame` key, per second. 0 = robots push.
@@ -228,6 +231,7 @@ impl Settings {
             depth_labels: 64,
             depth_near_m: 0.4,
             depth_far_m: 20.0,
+            mode: Mode::Learn,
             pose_wait_s: 0.2,
             pull_hz: 0.0,
             threads: 0,
@@ -297,6 +301,12 @@ impl Settings {
                 .pose_rotation_sd_rad
                 .unwrap_or(self.pose_rotation_sd_rad),
         }
+    }
+
+    /// How a robot's cameras begin.
+    pub fn mode(&self, robot: &str) -> Mode {
+        let own = self.robots.get(robot).and_then(|robot| robot.mode);
+        own.unwrap_or(self.mode)
     }
 
     /// # Errors

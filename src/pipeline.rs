@@ -13,10 +13,11 @@ use crate::{
         cpu::{CpuEngine, Observation, RecallView, Score},
     },
     isa::Isa,
-    memory::{Memory, visit::Visit},
+    memory::{Memory, forget::Forgetting, visit::Visit},
     model::{
         camera::Intrinsics,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
+        mode::Mode,
         pose::Pose,
         report::Report,
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
@@ -28,8 +29,10 @@ use crate::{
             merge::VIEWS_MAX,
             prior::{self, Prior},
         },
+        next_view::{self, Promise},
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
         select::select_into,
+        update::UpdateRules,
     },
 };
 
@@ -86,6 +89,7 @@ pub struct Pipeline {
     sides_depth: SidesDepth,
     engine: Engine,
     refiner: PoseRefiner,
+    update_rules: UpdateRules,
     memory: Memory,
     /// Viewpoints that were replaced: their memory is used again.
     spares: ArrayVec<Arc<Viewpoint>, SPARES_MAX>,
@@ -123,6 +127,7 @@ impl Pipeline {
             engine,
             pool,
             refiner: PoseRefiner::new(isa),
+            update_rules: UpdateRules::new(&settings),
             memory: Memory::default(),
             spares: ArrayVec::new(),
             cameras: HashMap::new(),
@@ -179,21 +184,38 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process(&mut self, frame: &Frame) -> Result<Report, FrameError> {
+        self.process_in(Mode::Learn, frame)
+    }
+
+    /// Compares a frame with the memory, which it changes as the mode says. Regions are followed in every mode.
+    ///
+    /// # Errors
+    /// A frame that cannot be used; nothing has changed then.
+    pub fn process_in(&mut self, mode: Mode, frame: &Frame) -> Result<Report, FrameError> {
         self.depth(frame)?;
         let mut camera = match self.cameras.get_mut(&frame.source) {
             Some(camera) => std::mem::take(camera),
             None => Camera::default(),
         };
-        let looked = self.look(frame, &mut camera.visit, true).map(|mut report| {
-            let id = self.remember(frame, &report.world_from_camera);
-            camera.visit.wrote(id);
-            camera
-                .follower
-                .follow(&mut report.regions, &mut self.last_region_id);
-            report.learned = true;
-            report.viewpoint_id = Some(id);
-            report
-        });
+        let before = (mode == Mode::Freeze).then(|| camera.visit.clone());
+        let learn = mode == Mode::Learn;
+        let looked = self
+            .look(frame, &mut camera.visit, learn)
+            .map(|mut report| {
+                if learn {
+                    let id = self.remember(frame, &report.world_from_camera);
+                    camera.visit.wrote(id);
+                    report.viewpoint_id = Some(id);
+                }
+                camera
+                    .follower
+                    .follow(&mut report.regions, &mut self.last_region_id);
+                report.learned = learn;
+                report
+            });
+        if let Some(before) = before {
+            camera.visit = before;
+        }
         match self.cameras.get_mut(&frame.source) {
             Some(slot) => *slot = camera,
             None => {
@@ -292,8 +314,24 @@ impl Pipeline {
     }
 
     /// Forgets what is known about a camera beside the viewpoints it wrote.
-    pub fn forget(&mut self, source: &Source) {
+    pub fn forget_camera(&mut self, source: &Source) {
         self.cameras.remove(source);
+    }
+
+    /// Goes on forgetting, over at most so many viewpoints; whether all is done.
+    pub fn forget(&mut self, forgetting: &mut Forgetting, viewpoints_max: usize) -> bool {
+        let memory = &mut self.memory;
+        let done = self
+            .pool
+            .install(|| memory.forget(forgetting, viewpoints_max));
+        self.engine.forget();
+        done
+    }
+
+    /// What an observation from a pose is expected to tell. One pass of the engine.
+    pub fn promise(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> Promise {
+        let at = self.prior(intrinsics, world_from_camera);
+        next_view::promise(&at.prior, &self.update_rules)
     }
 
     /// Compares a checked frame with what is expected; nothing is learnt yet.

@@ -72,8 +72,6 @@ fn place(with_object: bool) -> Scene {
 
 const SIZE: (usize, usize) = (128, 96);
 const STEPS: usize = 16;
-/// The way that is watched: the place is known beyond its ends.
-const WAY: std::ops::Range<usize> = 2..STEPS - 2;
 
 /// Along an arc around the table, a step every 4 cm.
 fn arc(step: usize, offset_m: f64) -> Pose {
@@ -167,7 +165,7 @@ fn a_learnt_place_is_not_surprising() {
     for preset in [Preset::Paper, Preset::Robust] {
         let mut robot = Robot::new(Settings::preset(preset));
         robot.learn(&place(false));
-        for step in WAY {
+        for step in 0..STEPS {
             let report = robot.see(&place(false), &arc(step, 0.006));
             assert!(
                 report.regions.is_empty(),
@@ -188,7 +186,7 @@ fn a_passing_robot_reports_a_new_object_on_its_whole_way() {
     let mut robot = Robot::new(Settings::robust());
     robot.learn(&place(false));
     let mut ids = Vec::new();
-    for step in WAY {
+    for step in 0..STEPS {
         let here = arc(step, 0.004);
         let report = robot.see(&place(true), &here);
         assert!(
@@ -208,20 +206,20 @@ fn a_passing_robot_reports_a_new_object_on_its_whole_way() {
 
     // On the way back it is known, and its removal is not surprising either.
     let mut known = 0;
-    for step in WAY.rev() {
+    for step in (0..STEPS).rev() {
         let here = arc(step, 0.0);
         known += usize::from(!finds(&robot.see(&place(true), &here), &here));
     }
-    assert!(known + 2 >= WAY.len(), "known in {known} of {}", WAY.len());
+    assert!(known + 2 >= STEPS, "known in {known} of {}", STEPS);
     let mut missed = 0;
-    for step in WAY {
+    for step in 0..STEPS {
         let here = arc(step, 0.002);
         missed += usize::from(finds(&robot.see(&place(false), &here), &here));
     }
     assert!(
         missed <= 2,
         "its removal surprised in {missed} of {}",
-        WAY.len()
+        STEPS
     );
 }
 

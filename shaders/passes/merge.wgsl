@@ -32,11 +32,7 @@ fn merge(@builtin(global_invocation_id) id: vec3<u32>) {
             let quad_number = (number - 1u) / 2u;
             let quad = load_quad(view, quad_number % view.width, quad_number / view.width);
             let surface = sample_quad(quad, ((number - 1u) & 1u) != 0u, f32(id.x), f32(id.y));
-            depth_m[count] = sample_depth_m(nearest[i * pixels + pixel]);
-            weight[count] = view.weight;
-            fresh |= view.fresh << count;
-            gathered[count] = gather(view, surface.u, surface.v);
-            count += 1u;
+            push(sample_depth_m(nearest[i * pixels + pixel]), gather(view, surface.u, surface.v), view);
         }
     }
     if count == 0u {

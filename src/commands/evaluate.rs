@@ -5,6 +5,8 @@
 
 mod depth;
 
+mod prior;
+
 use std::{
     fmt::Write as _,
     fs,
@@ -43,6 +45,10 @@ pub struct EvaluateArgs {
     /// pixels), or `simulated`: frames of the tabletop script.
     #[arg(long, value_name = "DIR|simulated", conflicts_with_all = ["dir", "csv", "figures", "leave_one_out"])]
     depth: Option<String>,
+    /// Judge instead what the memory expects where nobody stood: every fifth frame that the recording begins with is left
+    /// out of what is learnt, and compared with the prior there.
+    #[arg(long, conflicts_with_all = ["depth", "csv", "figures", "leave_one_out", "pose_noise_m", "pose_noise_deg", "ignore_world"])]
+    prior: bool,
     #[arg(long, value_enum, default_value_t)]
     preset: Preset,
     /// A setting by name; may be repeated.
@@ -166,6 +172,9 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
             .num_threads(settings.threads)
             .build()?,
     );
+    if arguments.prior {
+        return prior::run(&recordings, &settings, &pool, arguments.json);
+    }
     let noisy = arguments.pose_noise_m > 0.0 || arguments.pose_noise_deg > 0.0;
     let conditions = Conditions {
         ignored: arguments.ignore_world.iter().map(|ball| ball.0).collect(),

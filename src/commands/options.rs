@@ -5,7 +5,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use crate::{
     config::{ConfigError, Preset, Settings},
     engine::EngineKind,
-    memory::store::{Store, StoreError},
+    memory::store::Store,
     service::{self, session::ZenohOptions},
 };
 
@@ -67,14 +67,11 @@ impl ServiceOptions {
     /// # Errors
     /// Settings that are wrong, or a memory that cannot be opened.
     pub fn options(self, lasting: bool) -> Result<service::Options, ConfigError> {
-        let settings = self.settings.settings()?;
-        let memory = |error: StoreError| ConfigError::Memory(error.to_string());
         Ok(service::Options {
-            settings,
-            store: match self.memory {
-                Some(url) => Store::open(&url).map_err(memory)?,
-                None if lasting => Some(Store::in_data_folder().map_err(memory)?),
-                None => None,
+            settings: self.settings.settings()?,
+            store: match &self.memory {
+                None if !lasting => None,
+                url => stored_memory(url.as_deref())?,
             },
             engine: self.engine,
             root: self.root,
@@ -82,6 +79,18 @@ impl ServiceOptions {
             zenoh: self.zenoh,
         })
     }
+}
+
+/// Where memories last: at a URL, or else in this user's data folder. `None`: nowhere.
+///
+/// # Errors
+/// A memory that cannot be opened.
+pub fn stored_memory(url: Option<&str>) -> Result<Option<Store>, ConfigError> {
+    let store = match url {
+        Some(url) => Store::open(url),
+        None => Store::in_data_folder().map(Some),
+    };
+    store.map_err(|error| ConfigError::Memory(error.to_string()))
 }
 
 /// `None`: off.

@@ -1,14 +1,24 @@
 //! `surprised query`: asks a service's memory.
 
-use std::{path::PathBuf, str::FromStr};
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    str::FromStr,
+};
 
 use anyhow::{Context, bail};
 use clap::{Subcommand, ValueEnum};
 
 use crate::{
     config::ConfigError,
+    model,
     service::{client, session::ZenohOptions},
-    wire::{decode, keys, picture, proto},
+    wire::{
+        decode,
+        encode::{self, PriorPlane},
+        keys::{self, CameraPath},
+        picture, proto,
+    },
 };
 
 /// Asks a service what it remembers
@@ -22,10 +32,18 @@ pub struct Query {
 enum Question {
     /// What would be seen from a pose, as a PNG
     Prior(Prior),
+    /// How surprising a picture would be, as JSON; nothing is learnt
+    Evaluate(Evaluate),
     /// The viewpoints of a place, as JSON
     Views(Place),
     /// What the service says about a place, as JSON
     Status(Place),
+    /// From which poses a picture would teach most, as JSON, the best first
+    NextView(NextView),
+    /// How a camera's frames are taken, or are to be taken
+    Mode(Mode),
+    /// Takes a region, a span of time, or everything out of a place's memory, for good
+    Forget(Forget),
 }
 
 #[derive(Debug, clap::Args)]
@@ -45,10 +63,10 @@ struct Prior {
     #[command(flatten)]
     place: Place,
     /// world_from_camera: x,y,z in metres and the quaternion qx,qy,qz,qw; camera axes x right, y down, z forward.
-    #[arg(long, value_name = "X,Y,Z,QX,QY,QZ,QW", allow_hyphen_values = true)]
+    #[arg(long, value_name = POSE, allow_hyphen_values = true)]
     pose: Numbers<7>,
     /// Of the imagined camera, in pixels.
-    #[arg(long, value_name = "FX,FY,CX,CY,WIDTH,HEIGHT")]
+    #[arg(long, value_name = LENS)]
     intrinsics: Numbers<6>,
     /// What to show.
     #[arg(long, value_enum, default_value_t = Plane::Expected)]
@@ -56,6 +74,90 @@ struct Prior {
     /// Where to write the PNG.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
+}
+
+const POSE: &str = "X,Y,Z,QX,QY,QZ,QW";
+const LENS: &str = "FX,FY,CX,CY,WIDTH,HEIGHT";
+
+#[derive(Debug, clap::Args)]
+struct Evaluate {
+    #[command(flatten)]
+    place: Place,
+    /// The picture, a jpeg or png file.
+    #[arg(long, value_name = "FILE")]
+    image: PathBuf,
+    /// Its depth, a 16 bit png of millimetres.
+    #[arg(long, value_name = "FILE")]
+    depth: PathBuf,
+    /// Where it was taken: world_from_camera, as for `prior`.
+    #[arg(long, value_name = POSE, allow_hyphen_values = true)]
+    pose: Numbers<7>,
+    /// Of the camera that took it, in pixels.
+    #[arg(long, value_name = LENS)]
+    intrinsics: Numbers<6>,
+}
+
+#[derive(Debug, clap::Args)]
+struct NextView {
+    #[command(flatten)]
+    place: Place,
+    /// A candidate: world_from_camera, as for `prior`; may be repeated.
+    #[arg(
+        long = "candidate", value_name = POSE, allow_hyphen_values = true,
+        requires = "intrinsics", required_unless_present = "robot"
+    )]
+    candidates: Vec<Numbers<7>>,
+    /// Of the imagined camera, in pixels; small ones rank as well.
+    #[arg(long, value_name = LENS)]
+    intrinsics: Option<Numbers<6>>,
+    /// In place of candidates, a ring around where this robot was last.
+    #[arg(long, requires = "camera", conflicts_with = "candidates")]
+    robot: Option<String>,
+    /// Which camera of the robot.
+    #[arg(long, requires = "robot")]
+    camera: Option<String>,
+    /// Of the ring, metres; 0 turns on the spot.
+    #[arg(long, default_value_t = 0.0, requires = "robot")]
+    radius: f64,
+    /// How many poses the ring has.
+    #[arg(long, default_value_t = 8, requires = "robot")]
+    count: u32,
+}
+
+#[derive(Debug, clap::Args)]
+struct Mode {
+    #[command(flatten)]
+    place: Place,
+    /// Whose; without it the whole place's.
+    #[arg(long, requires = "camera")]
+    robot: Option<String>,
+    /// Which camera of the robot.
+    #[arg(long, requires = "robot")]
+    camera: Option<String>,
+    /// What it is from now on.
+    #[arg(long, value_enum)]
+    set: Option<model::mode::Mode>,
+}
+
+#[derive(Debug, clap::Args)]
+struct Forget {
+    #[command(flatten)]
+    place: Place,
+    /// What lies in this ball of the world, metres.
+    #[arg(long, value_name = "X,Y,Z,RADIUS", allow_hyphen_values = true)]
+    sphere: Option<Numbers<4>>,
+    /// What lies in this box along the world's axes, metres.
+    #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true)]
+    bounds: Option<Numbers<6>>,
+    /// What was written last from then on, seconds since 1970.
+    #[arg(long, value_name = "SECONDS")]
+    since: Option<f64>,
+    /// What was written last before, seconds since 1970.
+    #[arg(long, value_name = "SECONDS")]
+    until: Option<f64>,
+    /// The whole place.
+    #[arg(long)]
+    everything: bool,
 }
 
 /// So many numbers with commas between them.
@@ -96,8 +198,12 @@ impl Query {
     pub async fn run(self) -> anyhow::Result<()> {
         match self.question {
             Question::Prior(prior) => prior.run().await,
+            Question::Evaluate(evaluate) => evaluate.run().await,
             Question::Views(place) => print(&place.ask("views", "format=json").await?),
             Question::Status(place) => print(&place.ask("status", "").await?),
+            Question::NextView(next_view) => next_view.run().await,
+            Question::Mode(mode) => mode.run().await,
+            Question::Forget(forget) => forget.run().await,
         }
     }
 }
@@ -110,14 +216,32 @@ fn print(json: &[u8]) -> anyhow::Result<()> {
 
 impl Place {
     async fn ask(&self, question: &str, parameters: &str) -> anyhow::Result<Vec<u8>> {
+        self.ask_with(question, parameters, None).await
+    }
+
+    async fn ask_with(
+        &self,
+        question: &str,
+        parameters: &str,
+        request: Option<Vec<u8>>,
+    ) -> anyhow::Result<Vec<u8>> {
+        self.check()?;
+        let key = keys::memory(&self.root, &self.place, question);
+        self.get(&format!("{key}?{parameters}"), request).await
+    }
+
+    fn check(&self) -> anyhow::Result<()> {
         if !keys::is_root(&self.root) {
             return Err(ConfigError::Root(self.root.clone()).into());
         }
         if !keys::is_id(&self.place) {
             bail!("--place {}: a place is [a-z0-9_-]+", self.place);
         }
-        let key = keys::memory(&self.root, &self.place, question);
-        let answers = client::ask(&self.zenoh, &format!("{key}?{parameters}")).await?;
+        Ok(())
+    }
+
+    async fn get(&self, selector: &str, request: Option<Vec<u8>>) -> anyhow::Result<Vec<u8>> {
+        let answers = client::ask(&self.zenoh, selector, request).await?;
         answers
             .into_iter()
             .next()
@@ -126,33 +250,167 @@ impl Place {
     }
 }
 
+impl Numbers<7> {
+    fn pose(&self) -> proto::Pose {
+        let [x, y, z, qx, qy, qz, qw] = self.0;
+        proto::Pose {
+            position: Some(proto::Vector3 { x, y, z }),
+            orientation: Some(proto::Quaternion {
+                x: qx,
+                y: qy,
+                z: qz,
+                w: qw,
+            }),
+        }
+    }
+}
+
+impl Numbers<6> {
+    fn lens(&self) -> proto::Intrinsics {
+        let [fx, fy, cx, cy, width, height] = self.0;
+        proto::Intrinsics {
+            // Saturates; the service checks.
+            width: width as u32,
+            height: height as u32,
+            fx,
+            fy,
+            cx,
+            cy,
+            ..proto::Intrinsics::default()
+        }
+    }
+}
+
+impl Evaluate {
+    async fn run(self) -> anyhow::Result<()> {
+        let file = |path: &Path, encoding: &str| -> anyhow::Result<proto::Image> {
+            let data = fs::read(path).with_context(|| path.display().to_string())?;
+            Ok(proto::Image {
+                encoding: encoding.to_owned(),
+                data,
+                ..proto::Image::default()
+            })
+        };
+        let is_png = |path: &Path| path.extension().is_some_and(|end| end == "png");
+        let lens = self.intrinsics.lens();
+        let sized = |image| proto::Image {
+            width: lens.width,
+            height: lens.height,
+            ..image
+        };
+        let picture = if is_png(&self.image) { "png" } else { "jpeg" };
+        let request = proto::EvaluateRequest {
+            frame: Some(proto::Frame {
+                stamp: Some(encode::timestamp(0)),
+                image: Some(sized(file(&self.image, picture)?)),
+                depth: Some(sized(file(&self.depth, "png")?)),
+                world_from_camera: Some(self.pose.pose()),
+                calibration: Some(proto::Calibration {
+                    middle: Some(lens.clone()),
+                    ..proto::Calibration::default()
+                }),
+                ..proto::Frame::default()
+            }),
+        };
+        let bytes = encode::bytes(&request);
+        let answer = self.place.ask_with("evaluate", "", Some(bytes)).await?;
+        let reply: proto::EvaluateReply = decode::message(&answer)?;
+        let report = reply.report.context("the reply has no report")?;
+        println!("{}", serde_json::to_string_pretty(&encode::json(&report))?);
+        Ok(())
+    }
+}
+
+impl NextView {
+    async fn run(self) -> anyhow::Result<()> {
+        let request = proto::NextViewRequest {
+            candidates: self.candidates.iter().map(Numbers::pose).collect(),
+            ring: self.robot.map(|robot| proto::Ring {
+                around: None,
+                robot,
+                camera: self.camera.unwrap_or_default(),
+                radius: self.radius,
+                count: self.count,
+            }),
+            intrinsics: self.intrinsics.as_ref().map(Numbers::lens),
+        };
+        let bytes = encode::bytes(&request);
+        let answer = self.place.ask_with("next_view", "format=json", Some(bytes));
+        print(&answer.await?)
+    }
+}
+
+impl Mode {
+    async fn run(self) -> anyhow::Result<()> {
+        self.place.check()?;
+        let root = &self.place.root;
+        let key = match (&self.robot, &self.camera) {
+            (Some(robot), Some(camera)) => CameraPath::new(&self.place.place, robot, camera)
+                .context("robots and cameras are [a-z0-9_-]+")?
+                .key(root, keys::MODE),
+            _ => keys::memory(root, &self.place.place, keys::MODE),
+        };
+        let set = self
+            .set
+            .map_or(String::new(), |mode| format!(";set={}", mode.name()));
+        print(
+            &self
+                .place
+                .get(&format!("{key}?format=json{set}"), None)
+                .await?,
+        )
+    }
+}
+
+impl Forget {
+    async fn run(self) -> anyhow::Result<()> {
+        let stamp = |seconds: f64| encode::timestamp((seconds * 1e9).round() as i64);
+        let point = |numbers: &[f64]| {
+            Some(proto::Vector3 {
+                x: numbers[0],
+                y: numbers[1],
+                z: numbers[2],
+            })
+        };
+        let request = proto::ForgetRequest {
+            sphere: self.sphere.map(|Numbers(sphere)| proto::Sphere {
+                center: point(&sphere),
+                radius: sphere[3],
+            }),
+            r#box: self.bounds.map(|Numbers(bounds)| proto::WorldBox {
+                min: point(&bounds[..3]),
+                max: point(&bounds[3..]),
+            }),
+            span: (self.since.is_some() || self.until.is_some()).then(|| proto::TimeSpan {
+                since: self.since.map(stamp),
+                until: self.until.map(stamp),
+            }),
+            everything: self.everything,
+        };
+        let bytes = encode::bytes(&request);
+        let answer = self.place.ask_with("forget", "format=json", Some(bytes));
+        print(&answer.await?)
+    }
+}
+
 impl Prior {
     async fn run(self) -> anyhow::Result<()> {
-        let plane = match self.plane {
-            Plane::Expected => "expected",
-            Plane::Uncertainty => "uncertainty",
-            Plane::Coverage => "coverage",
-            Plane::Depth => "depth",
+        let (name, plane) = match self.plane {
+            Plane::Expected => ("expected", PriorPlane::Expected),
+            Plane::Uncertainty => ("uncertainty", PriorPlane::Uncertainty),
+            Plane::Coverage => ("coverage", PriorPlane::Coverage),
+            Plane::Depth => ("depth", PriorPlane::Depth),
         };
-        let names = [
-            "x", "y", "z", "qx", "qy", "qz", "qw", "fx", "fy", "cx", "cy", "width", "height",
-        ];
-        let mut parameters = format!("planes={plane}");
-        for (name, value) in names
-            .iter()
-            .zip(self.pose.0.iter().chain(&self.intrinsics.0))
-        {
-            parameters += &format!(";{name}={value}");
-        }
-        let answer = self.place.ask("prior", &parameters).await?;
+        let request = proto::PriorRequest {
+            world_from_camera: Some(self.pose.pose()),
+            intrinsics: Some(self.intrinsics.lens()),
+            planes: vec![name.to_owned()],
+        };
+        let bytes = encode::bytes(&request);
+        let answer = self.place.ask_with("prior", "", Some(bytes)).await?;
         let reply: proto::PriorReply = decode::message(&answer)?;
-        let png = match self.plane {
-            Plane::Expected => reply.expected.context("the reply has no image")?.data,
-            Plane::Uncertainty => shown(reply.uncertainty, |bytes| float(bytes).sqrt() / 60.0)?,
-            Plane::Coverage => shown(reply.coverage, |bytes| f32::from(bytes[0]) / 7.0)?,
-            Plane::Depth => shown(reply.depth, |bytes| float(bytes) / 10.0)?,
-        };
-        std::fs::write(&self.out, png).with_context(|| self.out.display().to_string())?;
+        let png = picture::plane_png(&reply, plane).context("the reply has no such plane")?;
+        fs::write(&self.out, png).with_context(|| self.out.display().to_string())?;
         println!(
             "{}: {:.1} % of the pixels are known, from viewpoints {:?}",
             self.out.display(),
@@ -161,24 +419,4 @@ impl Prior {
         );
         Ok(())
     }
-}
-
-fn float(bytes: &[u8]) -> f32 {
-    <[u8; 4]>::try_from(bytes).map_or(0.0, f32::from_le_bytes)
-}
-
-/// A plane as a PNG; `share` of white from a pixel's bytes.
-fn shown(image: Option<proto::Image>, share: impl Fn(&[u8]) -> f32) -> anyhow::Result<Vec<u8>> {
-    let image = image.context("the reply has no such plane")?;
-    let (width, height) = (image.width as usize, image.height as usize);
-    let bytes_per_pixel = image.data.len() / (width * height).max(1);
-    if bytes_per_pixel == 0 {
-        bail!("the reply's plane is empty");
-    }
-    let values: Vec<f32> = image
-        .data
-        .chunks_exact(bytes_per_pixel)
-        .map(share)
-        .collect();
-    Ok(picture::png(&picture::heat(width, height, &values, 1.0)))
 }

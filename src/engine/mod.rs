@@ -198,6 +198,13 @@ impl Engine {
         }
     }
 
+    /// Says that viewpoints were changed or removed without a frame.
+    pub fn forget(&mut self) {
+        if let Self::Gpu(gpu) = self {
+            gpu.forget();
+        }
+    }
+
     /// What computes, for people.
     pub fn name(&self) -> &str {
         match self {

@@ -10,6 +10,8 @@ pub mod method;
 
 pub mod measure;
 
+pub mod held_out;
+
 pub mod summary;
 
 pub mod figures;

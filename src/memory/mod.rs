@@ -1,6 +1,8 @@
-//! What a place remembers: its viewpoints, how they grow and which one a new posterior replaces.
+//! What a place remembers: its viewpoints, how they grow, which one a new posterior replaces, and what is forgotten.
 //!
 //! Viewpoints may be stored durably; then the memory is what is in RAM of them, and an index of the others.
+
+pub mod forget;
 
 pub mod residency;
 

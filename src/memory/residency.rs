@@ -71,6 +71,17 @@ impl Memory {
         heads
     }
 
+    /// Of those that are not in RAM, by id.
+    pub(super) fn absent_heads(&self) -> impl Iterator<Item = &Head> {
+        self.absent.values().map(|absent| &absent.head)
+    }
+
+    /// Notes that the viewpoint at this index has changed.
+    pub(super) fn touch(&mut self, index: usize) {
+        self.marks[index].change(self.turn);
+        self.note(self.viewpoints[index].id);
+    }
+
     /// Some that are not in RAM.
     pub fn some_absent(&self, count: usize) -> Vec<u64> {
         self.absent.keys().take(count).copied().collect()

@@ -24,6 +24,23 @@ pub struct Belief {
     pub p2: f32,
 }
 
+impl Belief {
+    /// Of a pixel about which nothing is known: anything from 0 to 255 is as likely. It is stored where something was
+    /// forgotten, and lies on no surface.
+    pub fn unknown() -> Self {
+        const ALPHA: f32 = 1.0;
+        const VARIANCE: f32 = 255.0 * 255.0 / 12.0;
+        Self {
+            alpha: ALPHA,
+            beta: [ALPHA * VARIANCE; CHANNELS],
+            tau: [127.5, 0.0, 0.0],
+            sigma: [1.0; CHANNELS],
+            tau2: [0.0; CHANNELS],
+            p2: 0.0,
+        }
+    }
+}
+
 /// Sixteen beliefs with one appearance, a plane a value.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct BeliefLanes {

@@ -3,7 +3,7 @@
 use crate::lanes::LANES;
 
 use super::{
-    belief::{LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
+    belief::{Belief, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
     camera::Intrinsics,
     frame::Source,
     pose::Pose,
@@ -76,16 +76,12 @@ impl Mesh {
         let Intrinsics { width, height, .. } = self.intrinsics;
         assert_eq!(self.depth_m.len(), width * height, "one depth a pixel");
         self.joined = cut;
-        let blocks = self.blocks();
+        self.find_ranges();
         self.cut.clear();
         self.cut
             .resize(width.saturating_sub(1) * height.saturating_sub(1), 0);
-        for plane in [&mut self.block_nearest_m, &mut self.block_farthest_m] {
-            plane.clear();
-            plane.resize(blocks * height, 0.0);
-        }
         // Half of a camera one pixel wide has no column.
-        if blocks == 0 {
+        if width < 2 {
             return;
         }
         let rows = || self.depth_m.chunks_exact(width);
@@ -103,11 +99,25 @@ impl Mesh {
                     u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT;
             }
         }
+    }
+
+    /// Least and greatest depth of every block.
+    #[inline(always)]
+    fn find_ranges(&mut self) {
+        let Intrinsics { width, height, .. } = self.intrinsics;
+        let blocks = self.blocks();
+        for plane in [&mut self.block_nearest_m, &mut self.block_farthest_m] {
+            plane.clear();
+            plane.resize(blocks * height, 0.0);
+        }
+        if blocks == 0 {
+            return;
+        }
         let ranges = self
             .block_nearest_m
             .chunks_exact_mut(blocks)
             .zip(self.block_farthest_m.chunks_exact_mut(blocks));
-        for (row, (nearest_m, farthest_m)) in rows().zip(ranges) {
+        for (row, (nearest_m, farthest_m)) in self.depth_m.chunks_exact(width).zip(ranges) {
             for block in 0..blocks {
                 // Quads need the vertex to their right.
                 let vertices = &row[block * LANES..(block * LANES + LANES + 1).min(width)];
@@ -120,6 +130,33 @@ impl Mesh {
                 farthest_m[block] = far;
             }
         }
+    }
+
+    /// Takes depth and triangles away from the vertices for which `gone` says so; the rest stays bit for bit.
+    fn clear(&mut self, gone: &[bool]) {
+        let Intrinsics { width, height, .. } = self.intrinsics;
+        let quads = width.saturating_sub(1);
+        for y in 0..height {
+            for x in (0..width).filter(|&x| gone[y * width + x]) {
+                self.depth_m[y * width + x] = 0.0;
+                // The quad to the lower right has this vertex in its upper left corner, and so on.
+                let corners = [
+                    (Some(y), Some(x), !UPPER_LEFT),
+                    (Some(y), x.checked_sub(1), 0),
+                    (y.checked_sub(1), Some(x), 0),
+                    (y.checked_sub(1), x.checked_sub(1), !LOWER_RIGHT),
+                ];
+                for (row, column, kept) in corners {
+                    if let (Some(row), Some(column)) = (row, column)
+                        && row + 1 < height
+                        && column < quads
+                    {
+                        self.cut[row * quads + column] &= kept;
+                    }
+                }
+            }
+        }
+        self.find_ranges();
     }
 
     /// Blocks of sixteen quads in a row.
@@ -262,8 +299,14 @@ impl Viewpoint {
         joined: MeshCut,
         records: Vec<Record>,
     ) -> Self {
+        let unknown = Record::pack(&Belief::unknown());
+        let forgotten: Vec<bool> = records
+            .iter()
+            .zip(&depth_m)
+            .map(|(record, &z)| *record == unknown && z <= 0.0)
+            .collect();
         let mesh = Mesh::new(head.intrinsics, depth_m, joined);
-        Self {
+        let mut viewpoint = Self {
             id: head.id,
             world_from_camera: head.world_from_camera,
             world_from_home: head.world_from_home,
@@ -273,7 +316,12 @@ impl Viewpoint {
             source: head.source,
             stamp_ns: head.stamp_ns,
             updates: head.updates,
+        };
+        // The coarse picture has forgotten more than its planes tell.
+        if forgotten.contains(&true) {
+            viewpoint.clear(&forgotten);
         }
+        viewpoint
     }
 
     pub fn head(&self) -> Head {
@@ -286,6 +334,40 @@ impl Viewpoint {
             stamp_ns: self.stamp_ns,
             updates: self.updates,
         }
+    }
+
+    /// Forgets the pixels for which `gone` says so, one flag a pixel: they lie on no surface any more, and nothing is
+    /// left of what they looked like. Everything else stays bit for bit.
+    pub fn clear(&mut self, gone: &[bool]) {
+        let width = self.mesh.intrinsics.width;
+        assert_eq!(gone.len(), self.records.len(), "one flag a pixel");
+        let unknown = Belief::unknown();
+        let record = Record::pack(&unknown);
+        for (held, _) in self.records.iter_mut().zip(gone).filter(|(_, gone)| **gone) {
+            *held = record;
+        }
+        self.mesh.clear(gone);
+        // A mean over four pixels is forgotten with any of them.
+        let coarse = self.coarse.mesh.intrinsics;
+        let gone_coarse: Vec<bool> = (0..coarse.pixels())
+            .map(|pixel| {
+                let upper = 2 * (pixel / coarse.width) * width + 2 * (pixel % coarse.width);
+                [upper, upper + 1, upper + width, upper + width + 1]
+                    .into_iter()
+                    .any(|fine| gone[fine])
+            })
+            .collect();
+        for pixel in (0..coarse.pixels()).filter(|&pixel| gone_coarse[pixel]) {
+            self.coarse.luminance[pixel] = unknown.tau[0];
+            self.coarse.variance[pixel] =
+                unknown.beta[0] / unknown.alpha * (1.0 + unknown.sigma[0]);
+        }
+        self.coarse.mesh.clear(&gone_coarse);
+    }
+
+    /// Nothing of it lies on a surface: nobody will ever see it.
+    pub fn is_empty(&self) -> bool {
+        self.mesh.depth_m.iter().all(|&z| z <= 0.0)
     }
 
     /// What it takes of the memory's budget.

@@ -16,7 +16,7 @@ use super::{
 };
 use crate::{
     model::{
-        camera::{RigCalibration, SideCalibration},
+        camera::{Intrinsics, RigCalibration, SideCalibration},
         frame::{
             DepthSource, Frame, FrameError, GreyImage, MarkersInWorld, RgbImage, SideView, Sides,
             Source,
@@ -62,6 +62,7 @@ pub struct Camera {
     /// Sequence of the last frame that could be read, refused or not.
     last_received: Option<u64>,
     last_image: Option<Arc<RgbImage>>,
+    last_pose: Option<Pose>,
     snapshot: Option<Arc<Snapshot>>,
     watched_until: Option<Instant>,
     watchers: Vec<Answer<Arc<Snapshot>>>,
@@ -159,6 +160,7 @@ impl Camera {
             order: StampOrder::default(),
             last_received: None,
             last_image: None,
+            last_pose: None,
             snapshot: None,
             watched_until: None,
             watchers: Vec::new(),
@@ -191,6 +193,15 @@ impl Camera {
             (_, Some(brought)) => Ok(Arc::new(Lenses::new(brought.clone(), limits)?)),
             (None, None) => Err(no_calibration()),
         }
+    }
+
+    /// Of the last calibration, and where the last frame was.
+    pub fn last_seen(&self) -> (Option<Intrinsics>, Option<Pose>) {
+        let lenses = self.calibration.as_ref();
+        (
+            lenses.map(|lenses| lenses.calibration.middle.intrinsics),
+            self.last_pose,
+        )
     }
 
     /// The calibration that the waiting frame brings, or else the one that is known.
@@ -349,10 +360,12 @@ impl Camera {
         &mut self,
         image: RgbImage,
         lenses: Arc<Lenses>,
+        world_from_camera: Pose,
         report: proto::SurpriseReport,
         stamp_ns: i64,
     ) {
         self.calibration = Some(lenses);
+        self.last_pose = Some(world_from_camera);
         self.order.accept(stamp_ns);
         self.last_image = Some(Arc::new(image));
         self.snapshot = None;

@@ -27,23 +27,27 @@ pub enum AskError {
     Silence { key: String },
 }
 
-/// Gets `selector` and returns the replies, each with the key it came on.
+/// Gets `selector`, with a request as bytes of its message if it needs one, and returns the replies, each with the key
+/// it came on.
 ///
 /// # Errors
 /// No session, a refusal, or no answer at all.
 pub async fn ask(
     options: &ZenohOptions,
     selector: &str,
+    request: Option<Vec<u8>>,
 ) -> Result<Vec<(String, Vec<u8>)>, AskError> {
     let session = zenoh::open(options.config(ANSWER_BYTES_MAX)?)
         .await
         .map_err(AskError::Zenoh)?;
-    let replies = session
+    let mut get = session
         .get(selector)
         .consolidation(QueryConsolidation::AUTO)
-        .timeout(ANSWER_WITHIN)
-        .await
-        .map_err(AskError::Zenoh)?;
+        .timeout(ANSWER_WITHIN);
+    if let Some(request) = request {
+        get = get.payload(request);
+    }
+    let replies = get.await.map_err(AskError::Zenoh)?;
     let mut answers = Vec::new();
     while let Ok(reply) = replies.recv_async().await {
         match reply.into_result() {

@@ -3,10 +3,10 @@
 //! | queue | bound | beyond it |
 //! |---|---|---|
 //! | frames | one a camera | the newest wins, the replaced is counted |
-//! | calibrations | one a camera | the newest wins |
+//! | calibrations, modes | one a camera | the newest wins |
 //! | poses and markers | [`POSES_MAX`] a camera | the oldest is dropped and counted |
 //! | refusals | [`REFUSALS_MAX`] a camera | the newest is only counted |
-//! | asks | [`ASKS_MAX`] | refused as busy and counted |
+//! | asks, the one under way included | [`ASKS_MAX`] | refused as busy and counted |
 //! | cameras | [`CAMERAS_MAX`] | the one unheard for a minute makes room, or the new one is refused |
 //!
 //! Putting never waits: the lock is held for moves only.
@@ -20,7 +20,7 @@ use std::{
 use zenoh::bytes::ZBytes;
 
 use super::ask::Ask;
-use crate::model::{frame::Source, refusal::Refusal};
+use crate::model::{frame::Source, mode::Mode, refusal::Refusal};
 
 /// A second of a 250 Hz tracker: a worker is never away for longer.
 pub const POSES_MAX: usize = 256;
@@ -48,6 +48,7 @@ pub enum Aside {
     /// The plate's markers, from which a pose follows.
     Markers(ZBytes),
     Calibration(ZBytes),
+    Mode(Mode),
     /// Not even worth decoding; the key's leaf on which it came.
     Refused(&'static str, Refusal),
 }
@@ -69,6 +70,7 @@ struct Slot {
     /// Poses and markers, in the order they came.
     poses: VecDeque<Aside>,
     calibration: Option<ZBytes>,
+    mode: Option<Mode>,
     refused: VecDeque<(&'static str, Refusal)>,
     live: bool,
     /// A get for a frame is under way.
@@ -81,6 +83,8 @@ struct Slot {
 struct State {
     cameras: BTreeMap<Source, Slot>,
     asks: VecDeque<Ask>,
+    /// One was taken and may come back.
+    ask_under_way: bool,
     asks_busy: u64,
     /// A camera came or went.
     live_changed: bool,
@@ -99,7 +103,8 @@ pub struct Inbox {
 #[derive(Debug, Default)]
 pub struct Delivery {
     pub asides: Vec<(Source, Aside)>,
-    pub asks: Vec<Ask>,
+    /// Asks can be taken.
+    pub asks: bool,
     /// Cameras whose frame can be taken.
     pub frames: Vec<Source>,
     /// A camera came or went.
@@ -129,6 +134,7 @@ impl Inbox {
             replaced_since_taken: 0,
             poses: VecDeque::new(),
             calibration: None,
+            mode: None,
             refused: VecDeque::new(),
             live: false,
             pulling: false,
@@ -165,6 +171,7 @@ impl Inbox {
                 slot.poses.push_back(aside);
             }
             Aside::Calibration(payload) => slot.calibration = Some(payload),
+            Aside::Mode(mode) => slot.mode = Some(mode),
             Aside::Refused(leaf, refusal) => {
                 if slot.refused.len() == REFUSALS_MAX {
                     slot.counters.refusals_dropped += 1;
@@ -188,7 +195,8 @@ impl Inbox {
     /// When the queue is full or the place is closing.
     pub fn put_ask(&self, ask: Ask) -> Result<(), NotAsked> {
         let mut state = self.lock();
-        if state.closed || state.asks.len() == ASKS_MAX {
+        let asks = state.asks.len() + usize::from(state.ask_under_way);
+        if state.closed || asks >= ASKS_MAX {
             state.asks_busy += 1;
             return Err(NotAsked);
         }
@@ -202,6 +210,29 @@ impl Inbox {
     pub fn put_memory_news(&self) {
         self.lock().memory_news = true;
         self.wake.notify_one();
+    }
+
+    /// The ask that waited longest since it came or was last worked at. It keeps its room until [`Self::end_ask`].
+    pub fn take_ask(&self) -> Option<Ask> {
+        let mut state = self.lock();
+        let ask = state.asks.pop_front()?;
+        state.ask_under_way = true;
+        Some(ask)
+    }
+
+    /// Ends the turn of the ask that was taken; what is left of it waits behind the others.
+    pub fn end_ask(&self, left: Option<Ask>) {
+        let mut state = self.lock();
+        state.ask_under_way = false;
+        state.asks.extend(left);
+    }
+
+    /// Makes sure that the camera has a slot.
+    ///
+    /// # Errors
+    /// `too_many_cameras`.
+    pub fn open(&self, source: &Source) -> Result<(), Refusal> {
+        self.with_slot(source, |_| ())
     }
 
     pub fn close(&self) {
@@ -305,7 +336,7 @@ fn make_room(state: &mut State) -> Result<(), Refusal> {
 impl State {
     fn deliver(&mut self, held: &impl Fn(&Source) -> bool) -> Delivery {
         let mut delivery = Delivery {
-            asks: self.asks.drain(..).collect(),
+            asks: !self.asks.is_empty(),
             live_changed: std::mem::take(&mut self.live_changed),
             memory_news: std::mem::take(&mut self.memory_news),
             closed: self.closed,
@@ -313,12 +344,14 @@ impl State {
         };
         for (source, slot) in &mut self.cameras {
             let calibration = slot.calibration.take().map(Aside::Calibration);
+            let mode = slot.mode.take().map(Aside::Mode);
             let poses = slot.poses.drain(..);
             let refused = slot
                 .refused
                 .drain(..)
                 .map(|(leaf, refusal)| Aside::Refused(leaf, refusal));
-            for aside in calibration.into_iter().chain(poses).chain(refused) {
+            let asides = calibration.into_iter().chain(mode);
+            for aside in asides.chain(poses).chain(refused) {
                 delivery.asides.push((source.clone(), aside));
             }
             if slot.frame.is_some() && !held(source) {
@@ -332,7 +365,7 @@ impl State {
 impl Delivery {
     fn is_empty(&self) -> bool {
         self.asides.is_empty()
-            && self.asks.is_empty()
+            && !self.asks
             && self.frames.is_empty()
             && !self.live_changed
             && !self.memory_news
@@ -387,6 +420,31 @@ mod tests {
             inbox.cameras()[&source(0)].1.poses_dropped,
             4 * 256 - POSES_MAX as u64
         );
+    }
+
+    #[test]
+    fn an_ask_keeps_its_room_while_it_is_worked_at() {
+        let inbox = Inbox::default();
+        let ask = || {
+            let (answer, _) = tokio::sync::oneshot::channel();
+            Ask::Mode {
+                camera: None,
+                set: None,
+                answer,
+            }
+        };
+        for _ in 0..ASKS_MAX {
+            inbox.put_ask(ask()).expect("room");
+        }
+        inbox.put_ask(ask()).expect_err("the queue is full");
+        let taken = inbox.take_ask().expect("one waits");
+        inbox.put_ask(ask()).expect_err("one is under way");
+        inbox.end_ask(Some(taken));
+        inbox.put_ask(ask()).expect_err("it is back");
+        drop(inbox.take_ask());
+        inbox.end_ask(None);
+        inbox.put_ask(ask()).expect("it was answered");
+        assert_eq!(inbox.asks_busy(), 3);
     }
 
     #[test]

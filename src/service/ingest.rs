@@ -24,9 +24,9 @@ use super::{
     places::{Places, Starts},
 };
 use crate::{
-    model::{frame::Source, refusal::Refusal},
+    model::{frame::Source, mode::Mode, refusal::Refusal},
     wire::{
-        decode::Limits,
+        decode::{self, Limits},
         encode,
         keys::{self, CameraPath},
         proto,
@@ -35,6 +35,8 @@ use crate::{
 
 /// Refusals to publish that no place's worker can.
 const REFUSALS_MAX: usize = 64;
+/// More than any name of a mode takes.
+const MODE_BYTES_MAX: usize = 64;
 /// A robot that does not answer a pull within this time is asked again.
 const PULL_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -57,6 +59,10 @@ pub struct IngestCounters {
     pub refused_unpublished: AtomicU64,
     /// Queries that found their queue full and ended without a reply.
     pub queries_dropped: AtomicU64,
+    /// Questions, over Zenoh or HTTP, that were refused as busy before they reached a place.
+    pub questions_busy: AtomicU64,
+    /// Questions that no place came to in time.
+    pub questions_late: AtomicU64,
 }
 
 /// Ends with its value.
@@ -112,6 +118,11 @@ impl Door {
             self.bad_key(sample.key_expr().as_str());
             return;
         };
+        if leaf == keys::MODE {
+            let aside =
+                mode(sample).map_or_else(|refusal| Aside::Refused(leaf, refusal), Aside::Mode);
+            return self.put(path, leaf, Message::Aside(aside));
+        }
         let checked = checked_payload(leaf, sample, self.limits.message_bytes_max());
         let message = match checked {
             Err(refusal) => Message::Aside(Aside::Refused(leaf, refusal)),
@@ -183,6 +194,19 @@ fn checked_payload(leaf: &str, sample: &Sample, bytes_max: usize) -> Result<ZByt
     Ok(sample.payload().clone())
 }
 
+/// As a `Mode`, or as its name in plain text.
+fn mode(sample: &Sample) -> Result<Mode, Refusal> {
+    if sample.payload().len() > MODE_BYTES_MAX {
+        return decode::questions::mode("");
+    }
+    let bytes = sample.payload().to_bytes();
+    if *sample.encoding() == keys::encoding::<proto::Mode>() {
+        return decode::questions::mode(&decode::message::<proto::Mode>(&bytes)?.mode);
+    }
+    // Whatever a shell calls it.
+    decode::questions::mode(&String::from_utf8_lossy(&bytes))
+}
+
 /// Subscribes to what robots send.
 ///
 /// # Errors
@@ -198,7 +222,13 @@ pub fn start(places: &Arc<Places>, starts: Starts) -> zenoh::Result<Ingest> {
     };
     let session = &places.session;
     let mut subscribers = Vec::new();
-    for leaf in [keys::CALIBRATION, keys::POSE, keys::MARKERS, keys::FRAME] {
+    for leaf in [
+        keys::MODE,
+        keys::CALIBRATION,
+        keys::POSE,
+        keys::MARKERS,
+        keys::FRAME,
+    ] {
         let door = door.clone();
         subscribers.push(
             session

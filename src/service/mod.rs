@@ -22,7 +22,11 @@ mod publish;
 
 mod ask;
 
+mod turns;
+
 mod status;
+
+mod questions;
 
 mod queries;
 
@@ -37,6 +41,7 @@ use self::{
     http::{Parts, Server},
     ingest::Ingest,
     places::Places,
+    questions::Questions,
     readiness::Readiness,
     session::ZenohOptions,
 };
@@ -89,7 +94,7 @@ pub enum ServeError {
 pub struct Service {
     places: Arc<Places>,
     ingest: Ingest,
-    queryable: Queryable<()>,
+    queryables: [Queryable<()>; 2],
     http: Option<Server>,
     readiness: Readiness,
     failures: mpsc::UnboundedReceiver<String>,
@@ -179,8 +184,8 @@ impl Service {
         let places = Arc::new(places);
         tokio::spawn(open_stored(places.clone()));
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
-        let queryable =
-            queries::start(&places, ingest.counters.clone()).map_err(ServeError::Zenoh)?;
+        let questions = Arc::new(Questions::new(places.clone(), ingest.counters.clone()));
+        let queryables = queries::start(&questions, &ingest.counters).map_err(ServeError::Zenoh)?;
         drop(workers_latch);
 
         let http = match listener {
@@ -190,6 +195,7 @@ impl Service {
                     places: places.clone(),
                     counters: ingest.counters.clone(),
                     locators: locators.clone(),
+                    questions,
                 };
                 let server = http::start(listener, readiness.clone(), parts)
                     .map_err(|error| ServeError::Http { addr, error })?;
@@ -211,7 +217,7 @@ impl Service {
         Ok(Self {
             places,
             ingest,
-            queryable,
+            queryables,
             http,
             readiness,
             failures,
@@ -245,7 +251,7 @@ impl Service {
         let Self {
             places,
             ingest,
-            queryable,
+            queryables,
             http,
             readiness,
             ..
@@ -255,7 +261,7 @@ impl Service {
         let finish = async move {
             // Nothing new comes in; then what has come is finished; then everybody is told.
             drop(ingest);
-            drop(queryable);
+            drop(queryables);
             // Closing joins threads.
             if let Err(error) = tokio::task::spawn_blocking(move || places.close()).await {
                 tracing::error!("the places did not close: {error}");

@@ -5,7 +5,7 @@ use std::{collections::BTreeMap, sync::Arc};
 use serde::Serialize;
 
 use super::inbox::SlotCounters;
-use crate::{memory::store::StoreStatus, wire::proto};
+use crate::{memory::store::StoreStatus, model::mode::Mode, wire::proto};
 
 #[derive(Debug, Clone, Default, Serialize)]
 pub struct PlaceStatus {
@@ -24,9 +24,15 @@ pub struct PlaceStatus {
     pub evicted: u64,
     /// `None`: the memory ends with the service.
     pub store: Option<StoreStatus>,
+    /// What cameras begin with.
+    pub mode: Mode,
     pub asks_answered: u64,
+    /// Passes of the engine that asks have taken.
+    pub ask_passes: u64,
     /// Asks refused because the queue was full.
     pub asks_busy: u64,
+    /// Asks whose askers had gone when their turn came.
+    pub asks_abandoned: u64,
     pub cameras: Vec<CameraStatus>,
 }
 
@@ -36,6 +42,7 @@ pub struct CameraStatus {
     pub camera: String,
     /// Its liveliness token is there.
     pub live: bool,
+    pub mode: Mode,
     /// Processed.
     pub frames: u64,
     /// Missing in the robot's sequence although nothing here replaced them.

@@ -1,5 +1,5 @@
 //! The thread that owns a place: its pipeline, its memory, and what is known about its cameras. It takes one frame at a
-//! time, of the camera that waited longest for its turn, and answers asks in between.
+//! time, of the camera that waited longest for its turn, and works at asks in between, as [`super::turns`] says.
 
 use std::{
     collections::BTreeMap,
@@ -10,30 +10,44 @@ use std::{
 use tokio::sync::watch;
 
 use super::{
-    ask::{Ask, Snapshot},
+    ask::{Ask, Evaluated, Snapshot},
     camera::{Camera, Refused, Turn, lenses_alone, pose_alone, unpack},
-    inbox::{Aside, Inbox},
+    inbox::{Aside, CAMERAS_MAX, Delivery, Inbox},
     publish::CameraPublisher,
-    status::PlaceStatus,
+    status::{CameraStatus, PlaceStatus},
+    turns::{self, Hands, take_turns},
 };
 use crate::{
-    memory::store::PlaceStore,
+    memory::{forget::Forgetting, store::PlaceStore},
     model::{
+        camera::Intrinsics,
         frame::{RgbImage, Source},
+        mode::Mode,
         pose::{Pose, PoseNoise},
         refusal::Refusal,
     },
     pipeline::Pipeline,
+    stages::next_view,
     wire::{
-        decode::{self, Limits, PackedFrame},
-        encode,
+        decode::{
+            self, Limits, PackedFrame,
+            questions::{Candidates, NextView, bad},
+        },
+        encode::{self, PriorPlanes},
         keys::{self, CameraPath},
         picture, proto,
     },
 };
 
-/// How long a closing worker goes on with frames that have already come.
-const FINISH_WITHIN: Duration = Duration::from_secs(2);
+/// Cameras whose modes are kept while the cameras themselves have made room for others.
+const MODES_MAX: usize = 1024;
+/// Viewpoints that a step of forgetting goes through: about the time of a frame, and more than all cameras can write
+/// between two steps, so that it comes to an end.
+const FORGET_STEP: usize = 2 * CAMERAS_MAX;
+/// Stored viewpoints that such a step brings into RAM.
+const FORGET_LOADED: usize = 16;
+/// A ring's camera is imagined no larger than this where nothing is said: ranks hardly depend on it.
+const IMAGINED_PIXELS_MAX: usize = 320 * 240;
 
 /// How long a starting worker waits for what is stored of its place.
 const READ_WITHIN: Duration = Duration::from_secs(3);
@@ -63,7 +77,18 @@ struct Desk {
     /// Whose last frame the pipeline's maps are of.
     maps_of: Option<Source>,
     frames: u64,
-    asks_answered: u64,
+    /// Set for the place since it began.
+    place_mode: Option<Mode>,
+    /// Set for single cameras since.
+    modes: BTreeMap<Source, Mode>,
+    asks: AskCounters,
+}
+
+#[derive(Debug, Default)]
+struct AskCounters {
+    answered: u64,
+    passes: u64,
+    abandoned: u64,
 }
 
 impl Worker {
@@ -80,7 +105,9 @@ impl Worker {
             cameras: BTreeMap::new(),
             maps_of: None,
             frames: 0,
-            asks_answered: 0,
+            place_mode: None,
+            modes: BTreeMap::new(),
+            asks: AskCounters::default(),
             worker: self,
         };
         if let Some(memory) = &desk.worker.memory {
@@ -88,53 +115,51 @@ impl Worker {
             memory.wait_read(READ_WITHIN);
         }
         desk.sync_memory();
-        desk.publish_status();
-        let mut wake = None;
-        let mut finish_by = None;
-        loop {
-            let inbox = desk.worker.inbox.clone();
-            let delivery = inbox.wait(wake, |source| {
-                desk.cameras
-                    .get(source)
-                    .is_some_and(|camera| camera.waiting.is_some())
-            });
-            if delivery.closed && finish_by.is_none() {
-                finish_by = Some(Instant::now() + FINISH_WITHIN);
-            }
-            for (source, aside) in delivery.asides {
-                desk.aside(&source, aside);
-            }
-            for ask in delivery.asks {
-                desk.answer(ask);
-            }
-            for source in delivery.frames {
-                desk.receive(&source);
-            }
-            desk.sync_memory();
-            desk.fit_markers();
-            let next = desk.turn();
-            wake = next.wake;
-            desk.publish_status();
-            if let Some(finish_by) = finish_by
-                && (!next.served || Instant::now() >= finish_by)
-            {
-                let Worker {
-                    memory, pipeline, ..
-                } = &mut desk.worker;
-                if let Some(memory) = memory {
-                    memory.close(pipeline.memory_mut(), STORE_WITHIN);
-                }
-                return;
-            }
+        let inbox = desk.worker.inbox.clone();
+        take_turns(&inbox, &mut desk);
+        let Worker {
+            memory, pipeline, ..
+        } = &mut desk.worker;
+        if let Some(memory) = memory {
+            memory.close(pipeline.memory_mut(), STORE_WITHIN);
         }
     }
 }
 
-/// What a turn came to.
-struct Next {
-    served: bool,
-    /// When the loop must look again even if nothing comes.
-    wake: Option<Instant>,
+impl Hands for Desk {
+    fn holds(&self, source: &Source) -> bool {
+        let camera = self.cameras.get(source);
+        camera.is_some_and(|camera| camera.waiting.is_some())
+    }
+
+    fn receive(&mut self, delivery: Delivery) {
+        for (source, aside) in delivery.asides {
+            self.aside(&source, aside);
+        }
+        for source in delivery.frames {
+            self.receive_frame(&source);
+        }
+        self.sync_memory();
+        self.fit_markers();
+    }
+
+    fn serve(&mut self, but: &[Source]) -> turns::Turn {
+        self.serve_longest_waiting(but)
+    }
+
+    fn step(&mut self, ask: Ask) -> Option<Ask> {
+        if ask.is_abandoned() {
+            self.asks.abandoned += 1;
+            return None;
+        }
+        let left = self.work_at(ask);
+        self.asks.answered += u64::from(left.is_none());
+        left
+    }
+
+    fn publish(&mut self) {
+        self.publish_status();
+    }
 }
 
 impl Desk {
@@ -162,6 +187,10 @@ impl Desk {
 
     fn aside(&mut self, source: &Source, aside: Aside) {
         let limits = self.limits;
+        let set = match aside {
+            Aside::Mode(mode) => self.set_mode(Some(source), mode),
+            _ => Ok(()),
+        };
         let Some(camera) = self.camera(source) else {
             return;
         };
@@ -182,6 +211,7 @@ impl Desk {
                     .and_then(|message| decode::calibration(&message))
                     .and_then(|calibration| camera.set_calibration(calibration, limits)),
             ),
+            Aside::Mode(_) => (keys::MODE, set),
             Aside::Refused(leaf, refusal) => (leaf, Err(refusal)),
         };
         if let Err(refusal) = result {
@@ -197,7 +227,7 @@ impl Desk {
         }
     }
 
-    fn receive(&mut self, source: &Source) {
+    fn receive_frame(&mut self, source: &Source) {
         let limits = self.limits;
         let Some((arrival, replaced)) = self.worker.inbox.take_frame(source) else {
             return;
@@ -225,14 +255,48 @@ impl Desk {
         }
     }
 
+    /// How the frames of a camera are taken.
+    fn mode(&self, source: &Source) -> Mode {
+        let set = self.modes.get(source).copied().or(self.place_mode);
+        set.unwrap_or_else(|| self.worker.pipeline.settings().mode(&source.robot))
+    }
+
+    /// How the cameras of the place begin.
+    fn mode_of_place(&self) -> Mode {
+        let settings = self.worker.pipeline.settings();
+        self.place_mode.unwrap_or(settings.mode)
+    }
+
+    /// Of a camera, or of all of them: what was said for single ones before is forgotten then.
+    fn set_mode(&mut self, source: Option<&Source>, mode: Mode) -> Result<(), Refusal> {
+        match source {
+            None => {
+                self.modes.clear();
+                self.place_mode = Some(mode);
+            }
+            Some(source) => {
+                if self.modes.len() == MODES_MAX && !self.modes.contains_key(source) {
+                    return Err(Refusal::new(
+                        "too_many_cameras",
+                        format!(
+                            "modes of {MODES_MAX} cameras are kept already: set the place's mode instead"
+                        ),
+                    ));
+                }
+                self.modes.insert(source.clone(), mode);
+            }
+        }
+        Ok(())
+    }
+
     /// Serves the ready frame of the camera that was served longest ago.
-    fn turn(&mut self) -> Next {
+    fn serve_longest_waiting(&mut self, but: &[Source]) -> turns::Turn {
         let now = Instant::now();
         let mut wake: Option<Instant> = None;
         let mut order: Vec<Source> = self
             .cameras
             .values()
-            .filter(|camera| camera.waiting.is_some())
+            .filter(|camera| camera.waiting.is_some() && !but.contains(&camera.path.source))
             .map(|camera| camera.path.source.clone())
             .collect();
         order.sort_by_key(|source| self.cameras.get(source).map(|camera| camera.served));
@@ -250,7 +314,7 @@ impl Desk {
                     self.frames += 1;
                     camera.served = self.frames;
                     let (stamp_ns, sequence) = (packed.stamp_ns, packed.sequence);
-                    if let Err(refusal) = self.serve(&source, pose, &packed) {
+                    if let Err(refusal) = self.serve_frame(&source, pose, &packed) {
                         self.frames -= 1;
                         self.refuse(
                             &source,
@@ -262,22 +326,24 @@ impl Desk {
                             },
                         );
                     }
-                    return Next {
-                        served: true,
-                        // Others may be ready now.
-                        wake: Some(now),
+                    return turns::Turn {
+                        served: Some(source),
+                        wake: None,
                     };
                 }
             }
         }
-        Next {
-            served: false,
-            wake,
-        }
+        turns::Turn { served: None, wake }
     }
 
-    fn serve(&mut self, source: &Source, pose: Pose, packed: &PackedFrame) -> Result<(), Refusal> {
+    fn serve_frame(
+        &mut self,
+        source: &Source,
+        pose: Pose,
+        packed: &PackedFrame,
+    ) -> Result<(), Refusal> {
         let started = Instant::now();
+        let mode = self.mode(source);
         let (limits, noise) = (self.limits, self.noise_default);
         let Some(camera) = self.cameras.get_mut(source) else {
             return Ok(());
@@ -291,10 +357,12 @@ impl Desk {
             ..
         } = &mut self.worker;
         if let Some(memory) = memory {
-            memory.may_learn()?;
+            if mode == Mode::Learn {
+                memory.may_learn()?;
+            }
             memory.bring(pipeline.memory_mut(), &pose);
         }
-        let report = pipeline.process(&frame)?;
+        let report = pipeline.process_in(mode, &frame)?;
         if let Some(memory) = memory {
             let held = pipeline.memory_mut();
             memory.sync(held);
@@ -305,7 +373,14 @@ impl Desk {
         let message = encode::report(&report, place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
-        camera.processed(frame.image, lenses, message, frame.stamp_ns);
+        let world_from_camera = report.world_from_camera;
+        camera.processed(
+            frame.image,
+            lenses,
+            world_from_camera,
+            message,
+            frame.stamp_ns,
+        );
         if camera.watched(Instant::now()) {
             camera.show(|image| snapshot(pipeline, image));
         }
@@ -355,9 +430,9 @@ impl Desk {
         camera.status.last_refusal = Some(format!("{}: {refusal}", refusal.code));
     }
 
-    fn answer(&mut self, ask: Ask) {
-        self.asks_answered += 1;
-        // Whoever asked may have gone: sending fails then, and there is nothing to do about it.
+    /// One step of an ask; what is left of it.
+    fn work_at(&mut self, ask: Ask) -> Option<Ask> {
+        // Whoever asked may have gone meanwhile: sending fails then, and there is nothing to do about it.
         match ask {
             Ask::Prior {
                 world_from_camera,
@@ -365,26 +440,28 @@ impl Desk {
                 planes,
                 answer,
             } => {
-                if !answer.is_closed() {
-                    self.bring(&world_from_camera);
-                    let prior = self.worker.pipeline.prior(&intrinsics, &world_from_camera);
-                    drop(answer.send(Ok(encode::prior_reply(&prior, &planes))));
-                }
+                self.asks.passes += 1;
+                self.bring(&world_from_camera);
+                let prior = self.worker.pipeline.prior(&intrinsics, &world_from_camera);
+                drop(answer.send(Ok(PriorPlanes::new(&prior, &planes))));
             }
             Ask::Evaluate {
                 frame,
                 camera,
                 answer,
             } => {
-                if !answer.is_closed() {
-                    drop(answer.send(self.evaluate(*frame, camera)));
-                }
+                self.asks.passes += 1;
+                drop(answer.send(self.evaluate(*frame, camera)));
             }
-            Ask::Views { answer } => {
-                let views = self.worker.pipeline.memory().heads();
-                drop(answer.send(Ok(proto::ViewsReply {
-                    views: views.iter().map(encode::view).collect(),
-                })));
+            Ask::Views {
+                after,
+                limit,
+                answer,
+            } => {
+                let memory = self.worker.pipeline.memory();
+                let views = memory.heads();
+                let asked = views.iter().filter(|view| view.id > after).take(limit);
+                drop(answer.send(Ok(encode::views_reply(asked, memory.known()))));
             }
             Ask::Snapshot { camera, answer } => {
                 let current = self.maps_of.as_ref() == Some(&camera);
@@ -395,20 +472,142 @@ impl Desk {
                         Instant::now(),
                         current.then_some(|image| snapshot(pipeline, image)),
                     ),
-                    None => drop(answer.send(Err(Refusal::new(
-                        "unknown_camera",
-                        "no frame of this camera has come yet",
-                    )))),
+                    None => drop(answer.send(Err(unknown_camera()))),
                 }
             }
+            Ask::NextView {
+                question,
+                camera,
+                answer,
+            } => match self.candidates(question, camera) {
+                Ok((candidates, intrinsics)) => {
+                    return self.work_at(Ask::Ranking {
+                        promises: Vec::with_capacity(candidates.len()),
+                        candidates,
+                        intrinsics,
+                        answer,
+                    });
+                }
+                Err(refusal) => drop(answer.send(Err(refusal))),
+            },
+            Ask::Ranking {
+                candidates,
+                intrinsics,
+                mut promises,
+                answer,
+            } => {
+                if let Some(candidate) = candidates.get(promises.len()) {
+                    self.asks.passes += 1;
+                    self.bring(candidate);
+                    promises.push(self.worker.pipeline.promise(&intrinsics, candidate));
+                }
+                if promises.len() < candidates.len() {
+                    return Some(Ask::Ranking {
+                        candidates,
+                        intrinsics,
+                        promises,
+                        answer,
+                    });
+                }
+                drop(answer.send(Ok(encode::next_view_reply(&candidates, &promises))));
+            }
+            Ask::Forget {
+                mut forgetting,
+                answer,
+            } => {
+                self.asks.passes += 1;
+                match self.forget_step(&mut forgetting) {
+                    Ok(true) => {}
+                    Ok(false) => return Some(Ask::Forget { forgetting, answer }),
+                    Err(refusal) => {
+                        drop(answer.send(Err(refusal)));
+                        return None;
+                    }
+                }
+                let left = self.worker.pipeline.memory().known();
+                let reply = encode::forget_reply(forgetting.forgotten(), left);
+                tracing::info!(
+                    place = &*self.worker.place,
+                    removed = reply.viewpoints_removed,
+                    changed = reply.viewpoints_changed,
+                    left,
+                    "forgotten as asked"
+                );
+                drop(answer.send(Ok(reply)));
+            }
+            Ask::Mode {
+                camera,
+                set,
+                answer,
+            } => {
+                let set = set.map_or(Ok(()), |mode| self.set_mode(camera.as_ref(), mode));
+                drop(answer.send(set.map(|()| match &camera {
+                    Some(camera) => self.mode(camera),
+                    None => self.mode_of_place(),
+                })));
+            }
         }
+        None
+    }
+
+    /// Whether all is forgotten now. What is only stored is gone through as well.
+    ///
+    /// # Errors
+    /// Another service writes the place.
+    fn forget_step(&mut self, forgetting: &mut Forgetting) -> Result<bool, Refusal> {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.may_learn()?;
+            let held = pipeline.memory_mut();
+            let stored = held.absent_to_forget(forgetting, FORGET_LOADED);
+            memory.fetch(held, stored);
+        }
+        let done = pipeline.forget(forgetting, FORGET_STEP);
+        self.sync_memory();
+        Ok(done)
+    }
+
+    /// The poses to compare, and the camera they are imagined for.
+    fn candidates(
+        &self,
+        question: NextView,
+        camera: Option<Source>,
+    ) -> Result<(Vec<Pose>, Intrinsics), Refusal> {
+        let camera = match camera {
+            Some(source) => Some(self.cameras.get(&source).ok_or_else(unknown_camera)?),
+            None => None,
+        };
+        let (intrinsics, last_pose) = camera.map_or((None, None), Camera::last_seen);
+        let missing = || {
+            bad(
+                "a ring needs a pose and intrinsics: fill `around` and `intrinsics`, or robot and camera of one that has sent frames",
+            )
+        };
+        let imagined = |mut intrinsics: Intrinsics| {
+            while intrinsics.pixels() > IMAGINED_PIXELS_MAX {
+                intrinsics = intrinsics.half();
+            }
+            intrinsics
+        };
+        let intrinsics = question.intrinsics.or(intrinsics.map(imagined));
+        let intrinsics = intrinsics.ok_or_else(missing)?;
+        let candidates = match question.candidates {
+            Candidates::Poses(poses) => poses,
+            Candidates::Ring(ring) => {
+                let around = ring.around.or(last_pose).ok_or_else(missing)?;
+                next_view::ring(&around, ring.radius_m, ring.count)
+            }
+        };
+        Ok((candidates, intrinsics))
     }
 
     fn evaluate(
         &mut self,
         frame: proto::Frame,
         camera: Option<Source>,
-    ) -> Result<proto::EvaluateReply, Refusal> {
+    ) -> Result<Evaluated, Refusal> {
         let started = Instant::now();
         let packed = decode::frame(frame)?;
         let known = camera.as_ref().and_then(|source| self.cameras.get(source));
@@ -433,10 +632,10 @@ impl Desk {
         self.maps_of = None;
         self.bring(&frame.world_from_camera);
         let report = self.worker.pipeline.evaluate(&frame)?;
-        let seconds = started.elapsed().as_secs_f64();
-        Ok(proto::EvaluateReply {
-            report: Some(encode::report(&report, &self.worker.place, seconds)),
-            map: Some(encode::surprise(self.worker.pipeline.maps())),
+        Ok(Evaluated {
+            report,
+            processing_seconds: started.elapsed().as_secs_f64(),
+            surprise: self.worker.pipeline.maps().score.surprise.clone(),
         })
     }
 
@@ -446,7 +645,7 @@ impl Desk {
         self.cameras.retain(|source, _| {
             let kept = slots.contains_key(source);
             if !kept {
-                pipeline.forget(source);
+                pipeline.forget_camera(source);
             }
             kept
         });
@@ -458,9 +657,13 @@ impl Desk {
         }
         let cameras: Vec<_> = self
             .cameras
-            .values()
-            .map(|camera| camera.status.clone())
+            .iter()
+            .map(|(source, camera)| CameraStatus {
+                mode: self.mode(source),
+                ..camera.status.clone()
+            })
             .collect();
+        let pipeline = &self.worker.pipeline;
         let memory = pipeline.memory();
         self.worker.status.send_replace(Arc::new(PlaceStatus {
             place: self.worker.place.to_string(),
@@ -473,11 +676,18 @@ impl Desk {
             memory_bytes: memory.bytes(),
             memory_bytes_max: pipeline.settings().memory_bytes,
             replaced_for_room: memory.replaced_for_room(),
-            asks_answered: self.asks_answered,
+            mode: self.mode_of_place(),
+            asks_answered: self.asks.answered,
+            ask_passes: self.asks.passes,
+            asks_abandoned: self.asks.abandoned,
             asks_busy: self.worker.inbox.asks_busy(),
             cameras,
         }));
     }
+}
+
+fn unknown_camera() -> Refusal {
+    Refusal::new("unknown_camera", "no frame of this camera has come yet")
 }
 
 fn snapshot(pipeline: &Pipeline, frame: Arc<RgbImage>) -> Snapshot {

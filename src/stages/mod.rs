@@ -23,3 +23,5 @@ pub mod update;
 pub mod surprise;
 
 pub mod attend;
+
+pub mod next_view;

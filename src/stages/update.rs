@@ -48,7 +48,7 @@ impl UpdateRules {
 
     /// (10): the uncertainty `beta / alpha` decides how far the expectation may move.
     #[inline(always)]
-    fn sigma_p(&self, sigma0: f32, uncertainty: f32) -> f32 {
+    pub fn sigma_p(&self, sigma0: f32, uncertainty: f32) -> f32 {
         let grown = sigma0 * exp((self.xi * uncertainty).min(EXPONENT_MAX));
         grown.max(self.sigma_min).min(self.sigma_max)
     }

@@ -4,21 +4,26 @@ use std::sync::LazyLock;
 
 use nalgebra::Point3;
 use prost::{Message, Name};
-use prost_reflect::{DescriptorPool, DynamicMessage};
+use prost_reflect::{DescriptorPool, DynamicMessage, MessageDescriptor};
 use prost_types::Timestamp;
 
 use super::{picture, proto};
 use crate::{
+    memory::forget::Forgotten,
     model::{
         camera::{Calibration, Intrinsics, RigCalibration, SideCalibrations},
         frame::{DepthSource, Frame, GreyImage, RgbImage, RigFrame},
+        mode::Mode,
         pose::Pose,
         refusal::Refusal,
         report::{Region, Report},
         viewpoint::Head,
     },
     pipeline::{Maps, PriorAt},
-    stages::interpolate::prior::{self, Prior},
+    stages::{
+        interpolate::prior::{self, Prior},
+        next_view::Promise,
+    },
 };
 
 /// A message of the contract.
@@ -35,12 +40,15 @@ static DESCRIPTORS: LazyLock<DescriptorPool> = LazyLock::new(|| {
         .expect("build.rs wrote the descriptors")
 });
 
+pub(super) fn descriptor<M: Named>() -> MessageDescriptor {
+    DESCRIPTORS
+        .get_message_by_name(&M::full_name())
+        .expect("every message of the contract is described")
+}
+
 /// As protobuf's JSON mapping says.
 pub fn json<M: Named>(message: &M) -> serde_json::Value {
-    let descriptor = DESCRIPTORS
-        .get_message_by_name(&M::full_name())
-        .expect("every message of the contract is described");
-    let dynamic = DynamicMessage::decode(descriptor, message.encode_to_vec().as_slice())
+    let dynamic = DynamicMessage::decode(descriptor::<M>(), message.encode_to_vec().as_slice())
         .expect("a message decodes as itself");
     serde_json::to_value(&dynamic).expect("messages map to JSON")
 }
@@ -212,8 +220,7 @@ pub fn plane(width: usize, height: usize, values: impl Iterator<Item = f32>) -> 
 
 /// `png`.
 pub fn expected(prior: &Prior) -> proto::Image {
-    let rgb = picture::expected_rgb(prior);
-    image("png", rgb.width, rgb.height, picture::png(&rgb))
+    png(&picture::expected_rgb(prior))
 }
 
 pub fn uncertainty(prior: &Prior) -> proto::Image {
@@ -308,6 +315,14 @@ pub enum PriorPlane {
 }
 
 impl PriorPlane {
+    pub const ALL: [Self; 5] = [
+        Self::Expected,
+        Self::Uncertainty,
+        Self::Coverage,
+        Self::Depth,
+        Self::Parameters,
+    ];
+
     /// As in `PriorRequest.planes`.
     pub fn parse(name: &str) -> Option<Self> {
         Some(match name {
@@ -319,30 +334,64 @@ impl PriorPlane {
             _ => return None,
         })
     }
-}
 
-pub fn prior_reply(at: &PriorAt, planes: &[PriorPlane]) -> proto::PriorReply {
-    let prior = &at.prior;
-    let mut reply = proto::PriorReply {
-        viewpoints_used: at.viewpoints_used.clone(),
-        covered: covered(prior),
-        ..proto::PriorReply::default()
-    };
-    for plane in planes {
-        match plane {
-            PriorPlane::Expected => reply.expected = Some(expected(prior)),
-            PriorPlane::Uncertainty => reply.uncertainty = Some(uncertainty(prior)),
-            PriorPlane::Coverage => reply.coverage = Some(coverage(prior)),
-            PriorPlane::Depth => reply.depth = Some(depth(prior)),
-            PriorPlane::Parameters => {
-                reply.parameters = (prior::ALPHA..prior::TAU2)
-                    .flat_map(|plane| prior.plane(plane))
-                    .flat_map(f32::to_le_bytes)
-                    .collect();
-            }
+    /// In a reply, before it is compressed.
+    pub fn bytes_per_pixel(self) -> usize {
+        match self {
+            Self::Expected => 3,
+            Self::Coverage => 1,
+            Self::Uncertainty | Self::Depth => 4,
+            Self::Parameters => 4 * (prior::TAU2 - prior::ALPHA),
         }
     }
-    reply
+}
+
+/// What was asked for of a prior, not yet drawn: drawing takes longer and needs no engine.
+#[derive(Debug, Clone)]
+pub struct PriorPlanes {
+    reply: proto::PriorReply,
+    expected: Option<RgbImage>,
+}
+
+impl PriorPlanes {
+    pub fn new(at: &PriorAt, planes: &[PriorPlane]) -> Self {
+        let prior = &at.prior;
+        let mut picked = Self {
+            reply: proto::PriorReply {
+                viewpoints_used: at.viewpoints_used.clone(),
+                covered: covered(prior),
+                ..proto::PriorReply::default()
+            },
+            expected: None,
+        };
+        let reply = &mut picked.reply;
+        for plane in planes {
+            match plane {
+                PriorPlane::Expected => picked.expected = Some(picture::expected_rgb(prior)),
+                PriorPlane::Uncertainty => reply.uncertainty = Some(uncertainty(prior)),
+                PriorPlane::Coverage => reply.coverage = Some(coverage(prior)),
+                PriorPlane::Depth => reply.depth = Some(depth(prior)),
+                PriorPlane::Parameters => {
+                    reply.parameters = (prior::ALPHA..prior::TAU2)
+                        .flat_map(|plane| prior.plane(plane))
+                        .flat_map(f32::to_le_bytes)
+                        .collect();
+                }
+            }
+        }
+        picked
+    }
+
+    pub fn draw(self) -> proto::PriorReply {
+        proto::PriorReply {
+            expected: self.expected.as_ref().map(png),
+            ..self.reply
+        }
+    }
+}
+
+fn png(rgb: &RgbImage) -> proto::Image {
+    image("png", rgb.width, rgb.height, picture::png(rgb))
 }
 
 /// Share of the pixels that some viewpoint saw.
@@ -359,5 +408,49 @@ pub fn view(viewpoint: &Head) -> proto::View {
         robot: viewpoint.source.robot.to_string(),
         camera: viewpoint.source.camera.to_string(),
         updates: viewpoint.updates,
+    }
+}
+
+/// `views` as they are to be listed; `total` are in the memory.
+pub fn views_reply<'a>(
+    views: impl Iterator<Item = &'a Head>,
+    total: usize,
+) -> proto::ViewsReply {
+    proto::ViewsReply {
+        views: views.map(view).collect(),
+        total: total as u64,
+    }
+}
+
+/// The most promising candidates first; those that promise the same keep their order.
+pub fn next_view_reply(candidates: &[Pose], promises: &[Promise]) -> proto::NextViewReply {
+    let candidates = candidates.iter().zip(promises).enumerate();
+    let mut views: Vec<proto::RankedView> = candidates
+        .map(|(index, (world_from_camera, promise))| proto::RankedView {
+            index: index as u32,
+            world_from_camera: Some(pose(world_from_camera)),
+            reduction: promise.reduction,
+            reduction_unseen: promise.reduction_unseen,
+            uncertainty: promise.uncertainty,
+            covered: promise.covered as f32,
+        })
+        .collect();
+    views.sort_by(|a, b| b.reduction.total_cmp(&a.reduction));
+    proto::NextViewReply { views }
+}
+
+pub fn forget_reply(forgotten: &Forgotten, left: usize) -> proto::ForgetReply {
+    let changed = forgotten.changed.iter();
+    proto::ForgetReply {
+        viewpoints_removed: forgotten.removed.len() as u64,
+        viewpoints_changed: changed.filter(|id| !forgotten.removed.contains(id)).count() as u64,
+        pixels: forgotten.pixels,
+        viewpoints_left: left as u64,
+    }
+}
+
+pub fn mode(mode: Mode) -> proto::Mode {
+    proto::Mode {
+        mode: mode.name().to_owned(),
     }
 }

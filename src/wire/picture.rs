@@ -10,6 +10,7 @@ use crate::{
         frame::RgbImage,
     },
     stages::interpolate::prior::{ALPHA, BETA, COVERAGE, Prior, TAU},
+    wire::{encode::PriorPlane, proto},
 };
 
 /// What nobody saw is shown in a grey that stands back.
@@ -73,5 +74,34 @@ pub fn heat(width: usize, height: usize, values: &[f32], full: f32) -> RgbImage 
         width,
         height,
         data,
+    }
+}
+
+/// Standard deviation, grey levels, viewpoints, and metres that are shown white.
+const UNCERTAINTY_FULL: f32 = 60.0;
+const COVERAGE_FULL: f32 = 7.0;
+const DEPTH_FULL_M: f32 = 10.0;
+
+/// One plane of a reply as a PNG; `None` if it was not asked for, or is no picture.
+pub fn plane_png(reply: &proto::PriorReply, plane: PriorPlane) -> Option<Vec<u8>> {
+    let float = |bytes: &[u8]| <[u8; 4]>::try_from(bytes).map_or(0.0, f32::from_le_bytes);
+    let shown = |image: Option<&proto::Image>, bytes: usize, share: &dyn Fn(&[u8]) -> f32| {
+        let image = image?;
+        let values: Vec<f32> = image.data.chunks_exact(bytes).map(share).collect();
+        let (width, height) = (image.width as usize, image.height as usize);
+        (values.len() == width * height).then(|| png(&heat(width, height, &values, 1.0)))
+    };
+    match plane {
+        PriorPlane::Expected => Some(reply.expected.as_ref()?.data.clone()),
+        PriorPlane::Uncertainty => shown(reply.uncertainty.as_ref(), 4, &|bytes| {
+            float(bytes).sqrt() / UNCERTAINTY_FULL
+        }),
+        PriorPlane::Coverage => shown(reply.coverage.as_ref(), 1, &|bytes| {
+            f32::from(bytes[0]) / COVERAGE_FULL
+        }),
+        PriorPlane::Depth => shown(reply.depth.as_ref(), 4, &|bytes| {
+            float(bytes) / DEPTH_FULL_M
+        }),
+        PriorPlane::Parameters => None,
     }
 }

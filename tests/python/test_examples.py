@@ -38,6 +38,13 @@ def test_publish_frames_prints_the_box_that_appears_and_ask_prior_knows_the_wall
     assert share and int(share[1]) >= 95, asked.stdout
     assert (tmp_path / "expected.png").read_bytes().startswith(b"\x89PNG")
 
+    planned = run("next_view.py", daemon, tmp_path)
+    assert planned.returncode == 0, planned.stderr
+    lines = planned.stdout.splitlines()
+    assert len(lines) == 8 and sorted(int(line.split()[0]) for line in lines) == list(range(0, 360, 45))
+    # The camera never turned: what lies ahead of it is known best, so it teaches least.
+    assert lines[-1].startswith("0 degrees"), planned.stdout
+
 
 def test_ask_prior_says_so_when_nobody_answers(daemon, tmp_path):
     script = (EXAMPLES / "ask_prior.py").read_text().replace('"lab"', '"attic"')

@@ -135,6 +135,16 @@ pub fn merge(
     if seen.is_empty() {
         return None;
     }
+    // What this visit wrote over, and did not confirm since, speaks for what was there before.
+    let seen: Vec<_> = seen
+        .iter()
+        .map(|&(mut said, weight, fresh)| {
+            if settings.earlier_appearance && fresh && weight < 0.5 && said.p2 >= 0.49 {
+                (said.tau, said.p2) = (said.tau2, 0.0);
+            }
+            (said, weight, fresh)
+        })
+        .collect();
     let weight = |i: usize| seen[i].1;
     let mut kept: Vec<usize> = (0..seen.len()).collect();
     // Step 2a.

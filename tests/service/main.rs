@@ -2,6 +2,8 @@
 
 mod rig;
 
+mod web;
+
 mod reports;
 
 mod newest_wins;
@@ -25,6 +27,16 @@ mod neighbours;
 mod nonsense;
 
 mod questions;
+
+mod posted;
+
+mod next_views;
+
+mod modes;
+
+mod forgetting;
+
+mod busy;
 
 mod pages;
 

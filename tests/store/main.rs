@@ -3,6 +3,8 @@
 #[path = "../reference/mod.rs"]
 mod reference;
 
+mod archives;
+
 mod rig;
 
 mod flaky;

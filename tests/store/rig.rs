@@ -1,5 +1,8 @@
 //! Services that learn a place and store it: the real tasks on a runtime of their own, with small viewpoints.
 
+// Every test takes the part it needs.
+#![allow(dead_code)]
+
 use std::{
     collections::BTreeMap,
     sync::Arc,
@@ -80,7 +83,7 @@ pub fn at(x_m: f64) -> Pose {
     scene::pose([x_m, 0.0, 0.0], [0.0; 3])
 }
 
-/// Of noise that follows from the seed.
+/// Of noise that follows from the seed, which is its stamp as well.
 pub fn any_viewpoint(x_m: f64, seed: u64) -> Viewpoint {
     let camera = scene::camera(SIZE.0, SIZE.1);
     let mut random = Random(seed);
@@ -90,7 +93,9 @@ pub fn any_viewpoint(x_m: f64, seed: u64) -> Viewpoint {
     let depth_m = (0..camera.pixels())
         .map(|_| random.uniform(1.0, 1.01) as f32)
         .collect();
-    scene::viewpoint(camera, &at(x_m), depth_m, records)
+    let mut viewpoint = scene::viewpoint(camera, &at(x_m), depth_m, records);
+    viewpoint.stamp_ns = seed as i64;
+    viewpoint
 }
 
 pub struct Service {

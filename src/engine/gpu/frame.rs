@@ -284,6 +284,11 @@ impl State {
         counters.resident_bytes = self.arenas.bytes();
     }
 
+    /// Viewpoints changed elsewhere: the next recall brings what it needs.
+    pub fn forget(&mut self) {
+        self.arenas.residency.clear();
+    }
+
     /// Brings the views that are not there, and says where all of them are.
     fn bring(
         &mut self,

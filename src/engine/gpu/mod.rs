@@ -216,6 +216,10 @@ impl GpuEngine {
         self.state.remember(viewpoint, &mut self.counters);
     }
 
+    pub(super) fn forget(&mut self) {
+        self.state.forget();
+    }
+
     /// Tries on this device and, if it is lost, on the next; `None`: what was asked does not fit.
     fn persevere<T>(
         &mut self,

@@ -260,6 +260,12 @@ pub fn decode(bytes: &[u8], pixels_max: usize) -> Result<(Label, Viewpoint), For
     Ok((read.label, viewpoint))
 }
 
+/// # Errors
+/// Bytes that are no stored viewpoint, or damaged anywhere.
+pub fn check(bytes: &[u8]) -> Result<(), FormError> {
+    checked_planes(bytes, &decode_head(bytes)?).map(|_| ())
+}
+
 /// The planes of an object whose length and checksum are right.
 fn checked_planes<'a>(bytes: &'a [u8], read: &ReadHead) -> Result<&'a [u8], FormError> {
     let (got, said) = (bytes.len() as u64, read.object_bytes);

@@ -83,7 +83,10 @@ async fn tend(shared: &Shared, mut lease: Lease) -> Tended {
         Ok(true) => {
             shared.lock().trusted_until = Some(lease.trusted_until());
             shared.for_writer.notify_one();
-            Ok(Some(lease))
+            match set_aside(shared).await {
+                Ok(_) => Ok(Some(lease)),
+                Err(error) => Err((Some(lease), error)),
+            }
         }
         Ok(false) => {
             lost(shared);
@@ -178,15 +181,10 @@ async fn tidy(shared: &Shared, lease: &Lease) -> Result<()> {
     for stranger in &read.strangers {
         shared.shelf.move_aside(stranger).await?;
     }
-    let damaged = shared.lock().damaged.clone();
-    for &(id, version) in damaged.keys() {
-        shared.shelf.set_aside(id, version).await?;
-    }
+    let found = read.strangers.len() + set_aside(shared).await?;
     // Also what was set aside in earlier times.
     let (names, count) = shared.shelf.damaged(NAMES_MAX).await?;
-    let found = damaged.len() + read.strangers.len();
     let mut state = shared.lock();
-    state.damaged.clear();
     let recovered = state.catalogue.len();
     state.counters.damaged = count;
     state.counters.damaged_names = names.clone();
@@ -206,6 +204,30 @@ async fn tidy(shared: &Shared, lease: &Lease) -> Result<()> {
     );
     shared.for_writer.notify_one();
     Ok(())
+}
+
+/// Moves damaged objects away from the others; how many. Only for who writes the place.
+async fn set_aside(shared: &Shared) -> Result<usize> {
+    let damaged: Vec<(u64, Version)> = shared.lock().damaged.keys().copied().collect();
+    for &(id, version) in &damaged {
+        let path = match shared.shelf.set_aside(id, version).await {
+            // Somebody else did, or deleted it.
+            Err(Error::NotFound { .. }) => {
+                shared.lock().damaged.remove(&(id, version));
+                continue;
+            }
+            moved => moved?,
+        };
+        tracing::error!(place = &*shared.place, "what is damaged is kept as {path}");
+        let mut state = shared.lock();
+        state.damaged.remove(&(id, version));
+        let counters = &mut state.counters;
+        counters.damaged += 1;
+        if counters.damaged_names.len() < NAMES_MAX {
+            counters.damaged_names.push(path.to_string());
+        }
+    }
+    Ok(damaged.len())
 }
 
 /// What is stored beside the viewpoints as they are.

@@ -9,7 +9,7 @@ use tokio::task::{JoinSet, spawn_blocking};
 use super::{
     Backoff,
     form::{self, FormError},
-    place::{NAMES_MAX, News, Role, Shared},
+    place::{News, Shared},
     planes,
 };
 use crate::memory::Version;
@@ -117,7 +117,6 @@ async fn load_one(shared: Arc<Shared>, id: u64, version: Version) -> bool {
         Ok(Err(error)) => {
             note_damaged(&shared, id, version, &error);
             shared.forget(id);
-            set_aside(&shared, id, version).await;
         }
         Err(error) => tracing::error!("reading a viewpoint failed: {error}"),
     }
@@ -125,39 +124,13 @@ async fn load_one(shared: Arc<Shared>, id: u64, version: Version) -> bool {
     true
 }
 
-/// Says that an object is damaged, and keeps it from being read again.
+/// Says that an object is damaged, and keeps it from being read again. The keeper sets it aside.
 pub fn note_damaged(shared: &Shared, id: u64, version: Version, why: &FormError) {
     let name = shared.shelf.viewpoint(id, version).to_string();
     tracing::error!(
         place = &*shared.place,
         "viewpoint {id} is damaged and is not loaded: {why}; it is {name}"
     );
-    let mut state = shared.lock();
-    state.damaged.insert((id, version), name.clone());
-    let counters = &mut state.counters;
-    counters.damaged += 1;
-    if counters.damaged_names.len() < NAMES_MAX {
-        counters.damaged_names.push(name);
-    }
-}
-
-/// Moves a damaged object away from the others, if this service writes the place.
-async fn set_aside(shared: &Shared, id: u64, version: Version) {
-    if shared.lock().role != Role::Writer {
-        return;
-    }
-    match shared.shelf.set_aside(id, version).await {
-        Ok(path) => {
-            tracing::error!(place = &*shared.place, "it is kept as {path}");
-            let mut state = shared.lock();
-            let before = state.damaged.remove(&(id, version));
-            for name in &mut state.counters.damaged_names {
-                if Some(&*name) == before.as_ref() {
-                    *name = path.to_string();
-                }
-            }
-        }
-        // The next one to take the place tries again.
-        Err(error) => tracing::warn!("a damaged viewpoint could not be set aside: {error}"),
-    }
+    shared.lock().damaged.insert((id, version), name);
+    shared.for_keeper.notify_one();
 }

@@ -18,6 +18,8 @@
 //! longer all the same is counted as late: frames never wait for a slow store. While the store cannot be reached, the
 //! service goes on in RAM, tries again ever less often, up to every [`RETRY_MAX`], and says so.
 
+pub mod archive;
+
 pub mod form;
 
 mod keeper;

@@ -420,7 +420,24 @@ impl PlaceStore {
             return Brought::Hit;
         }
         let began = Instant::now();
-        let mut left = needed;
+        let is_complete = self.fetch(memory, needed);
+        let mut state = self.shared.lock();
+        state.counters.misses += 1;
+        state.counters.miss_seconds += began.elapsed().as_secs_f64();
+        if is_complete {
+            return Brought::Loaded;
+        }
+        state.counters.incomplete += 1;
+        Brought::Incomplete
+    }
+
+    /// Loads these viewpoints and waits for them, but no longer than [`BRING_WITHIN`]; whether all are there.
+    pub fn fetch(&self, memory: &mut Memory, ids: Vec<u64>) -> bool {
+        let began = Instant::now();
+        let mut left = ids;
+        if left.is_empty() {
+            return true;
+        }
         // What changed its state while it was loaded is loaded once more.
         for _ in 0..2 {
             let mut state = self.shared.lock();
@@ -443,17 +460,10 @@ impl PlaceStore {
             self.sync(memory);
             left = memory.absent_of(&left);
             if left.is_empty() {
-                break;
+                return true;
             }
         }
-        let mut state = self.shared.lock();
-        state.counters.misses += 1;
-        state.counters.miss_seconds += began.elapsed().as_secs_f64();
-        if left.is_empty() {
-            return Brought::Loaded;
-        }
-        state.counters.incomplete += 1;
-        Brought::Incomplete
+        false
     }
 
     /// Has loaded what a robot will need if it goes on as it went.
@@ -497,6 +507,12 @@ impl PlaceStore {
             epoch: state.epoch,
             stored_viewpoints: state.catalogue.len(),
             stored_bytes: state.catalogue.values().map(|known| known.bytes).sum(),
+            damaged: state.counters.damaged + state.damaged.len() as u64,
+            damaged_names: {
+                let aside = state.counters.damaged_names.iter();
+                let others = aside.chain(state.damaged.values());
+                others.take(NAMES_MAX).cloned().collect()
+            },
             pending: state.pending.len() + state.writing,
             pending_s: oldest.map_or(0.0, |since| since.elapsed().as_secs_f64()),
             ..state.counters.clone()

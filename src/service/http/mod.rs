@@ -9,10 +9,14 @@
 //! GET /api/v1/places/{place}/views                  the memory's viewpoints
 //! GET /api/v1/places/{place}/robots/{robot}/{camera}            the camera's status and last report
 //! GET .../robots/{robot}/{camera}/{frame|expected|surprise|uncertainty}.png
+//! POST /api/v1/places/{place}/{prior|evaluate|next_view|forget}     questions, see [`asks`]
+//! GET, PUT /api/v1/places/{place}/mode, .../robots/{robot}/{camera}/mode
 //! ```
 //!
-//! Status is read from published snapshots; views and pictures are asks to the place's worker. Errors are
+//! Status is read from published snapshots; everything else is asked of the place's worker. Errors are
 //! `application/problem+json`.
+
+mod asks;
 
 mod limits;
 
@@ -22,21 +26,21 @@ use std::{net::SocketAddr, sync::Arc, time::Duration};
 
 use axum::{
     Json, Router,
-    extract::{Path, State},
+    extract::{DefaultBodyLimit, Path, State},
     http::{StatusCode, header},
     response::{IntoResponse, Response},
     routing::get,
 };
 use serde_json::{Value, json};
 use tokio::{net::TcpListener, sync::oneshot, task::JoinHandle};
-use tower_http::{limit::RequestBodyLimitLayer, timeout::TimeoutLayer};
+use tower_http::timeout::TimeoutLayer;
 
 use self::{limits::LimitedListener, problem::Problem};
 use super::{
     ask::{Ask, Snapshot},
     ingest::IngestCounters,
     places::{Place, Places},
-    queries::ask,
+    questions::Questions,
     readiness::Readiness,
 };
 use crate::{
@@ -58,6 +62,7 @@ pub struct Parts {
     pub places: Arc<Places>,
     pub counters: Arc<IngestCounters>,
     pub locators: Vec<String>,
+    pub questions: Arc<Questions>,
 }
 
 #[derive(Clone)]
@@ -120,9 +125,9 @@ fn router(app: App) -> Router {
         .route("/api/v1/info", get(info))
         .route("/api/v1/places", get(places))
         .route("/api/v1/places/{place}", get(place_status))
-        .route("/api/v1/places/{place}/views", get(views))
         .route(camera, get(camera_status))
         .route(&format!("{camera}/{{picture}}"), get(camera_picture))
+        .merge(asks::routes())
         .fallback(|| async {
             Problem::not_found("there is no such page: /api/v1/places is a start")
         })
@@ -130,14 +135,14 @@ fn router(app: App) -> Router {
             Problem::new(
                 StatusCode::METHOD_NOT_ALLOWED,
                 "method",
-                "this page is read with GET",
+                "this page is not asked for in this way: most are read with GET, questions are asked with POST, modes are set with PUT",
             )
         })
         .layer(TimeoutLayer::with_status_code(
             StatusCode::GATEWAY_TIMEOUT,
             REQUEST_WITHIN,
         ))
-        .layer(RequestBodyLimitLayer::new(BODY_BYTES_MAX))
+        .layer(DefaultBodyLimit::max(BODY_BYTES_MAX))
         .with_state(app)
 }
 
@@ -199,12 +204,6 @@ async fn place_status(
     Ok(Json(json!(*status)))
 }
 
-async fn views(State(app): State<App>, Path(place): Path<String>) -> Result<Json<Value>, Problem> {
-    let place = known(&app, &place)?;
-    let views = ask(&place, |answer| Ask::Views { answer }).await?;
-    Ok(Json(encode::json(&views)))
-}
-
 async fn camera_status(
     State(app): State<App>,
     Path((place, robot, camera)): Path<(String, String, String)>,
@@ -246,7 +245,10 @@ async fn camera_picture(
         robot: robot.into(),
         camera: camera.into(),
     };
-    let snapshot = ask(&place, |answer| Ask::Snapshot { camera, answer }).await?;
+    let questions = &app.parts.questions;
+    let snapshot = questions
+        .ask(&place, |answer| Ask::Snapshot { camera, answer })
+        .await?;
     let png = tokio::task::spawn_blocking(move || picture::png(&draw(&snapshot)))
         .await
         .map_err(|error| {

@@ -39,7 +39,10 @@ impl From<Refusal> for Problem {
     fn from(refusal: Refusal) -> Self {
         let status = match refusal.code {
             "busy" | "closing" => StatusCode::SERVICE_UNAVAILABLE,
-            "unknown_camera" => StatusCode::NOT_FOUND,
+            "late" => StatusCode::GATEWAY_TIMEOUT,
+            "unknown_camera" | "unknown_place" => StatusCode::NOT_FOUND,
+            "message_too_large" => StatusCode::PAYLOAD_TOO_LARGE,
+            "media_type" => StatusCode::UNSUPPORTED_MEDIA_TYPE,
             _ => StatusCode::BAD_REQUEST,
         };
         Self::new(status, refusal.code, refusal.detail)

@@ -28,6 +28,11 @@ const COLOUR_TOLERANCE: f32 = 40.0;
 const COLOUR_CAP: f32 = 80.0;
 /// What was there before is never certain.
 const P2_MAX: f32 = 0.95;
+/// A fresh view that weighs less speaks for what was there before the visit: the robot only passes.
+const SETTLED_WEIGHT: f32 = 0.5;
+/// The last write of a record with at least this weight of its earlier appearance replaced its appearance (step 6 gives
+/// 0.5, and each later one halves it).
+const P2_REPLACED: f32 = 0.49;
 
 /// Which of the steps are on.
 #[derive(Debug, Clone, Copy)]
@@ -89,6 +94,13 @@ impl Gathered {
 
     fn p2(&self) -> f32 {
         self.spread[7]
+    }
+
+    /// What it said before its last write.
+    fn before(mut self) -> Self {
+        self.level.copy_within(3..6, 0);
+        self.spread[7] = 0.0;
+        self
     }
 }
 
@@ -174,6 +186,7 @@ pub fn merge_row<G: Gather>(
                         1.0 / source.inverse_depth[lane],
                         interpolate(gather_view, source, lane),
                         view,
+                        rules,
                     );
                 }
             }
@@ -348,8 +361,14 @@ impl Pixel {
     }
 
     #[inline(always)]
-    fn push(&mut self, depth_m: f32, gathered: Gathered, view: &MergeView) {
+    fn push(&mut self, depth_m: f32, gathered: Gathered, view: &MergeView, rules: MergeRules) {
         let index = self.count;
+        let unsettled = rules.earlier_appearance && view.fresh && view.weight < SETTLED_WEIGHT;
+        let gathered = if unsettled && gathered.p2() >= P2_REPLACED {
+            gathered.before()
+        } else {
+            gathered
+        };
         self.depth_m[index] = depth_m;
         self.weight[index] = view.weight;
         self.fresh |= u32::from(view.fresh) << index;

@@ -3,6 +3,8 @@
 
 pub mod image;
 
+pub mod questions;
+
 mod rig;
 
 use prost::Message;
