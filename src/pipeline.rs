@@ -237,15 +237,9 @@ impl Pipeline {
         fresh.mesh.intrinsics = frame.intrinsics;
         std::mem::swap(&mut fresh.mesh.depth_m, &mut work.depth_m);
         fresh.records.clear();
-        fresh
-            .records
-            .extend_from_slice(&self.maps.score.posterior);
-        self.engine.prepare(
-            &mut fresh.mesh,
-            &fresh.records,
-            &mut fresh.coarse,
-            work.cut,
-        );
+        fresh.records.extend_from_slice(&self.maps.score.posterior);
+        self.engine
+            .prepare(&mut fresh.mesh, &fresh.records, &mut fresh.coarse, work.cut);
         let slot = self.memory.slot(
             &work.selected,
             world_from_camera,

@@ -38,14 +38,17 @@ fn main() {
     if let Some(folder) = env::var_os(CHILD) {
         learn_until_killed(&PathBuf::from(folder));
     }
-    let trial = Trial::test("killed_at_200_random_instants_it_loses_no_more_than_it_says", || {
-        let lanes = (0..LANES).map(|lane| std::thread::spawn(move || kill_often(lane)));
-        let lanes: Vec<_> = lanes.collect();
-        for lane in lanes {
-            lane.join().map_err(|_| Failed::from("see above"))?;
-        }
-        Ok(())
-    });
+    let trial = Trial::test(
+        "killed_at_200_random_instants_it_loses_no_more_than_it_says",
+        || {
+            let lanes = (0..LANES).map(|lane| std::thread::spawn(move || kill_often(lane)));
+            let lanes: Vec<_> = lanes.collect();
+            for lane in lanes {
+                lane.join().map_err(|_| Failed::from("see above"))?;
+            }
+            Ok(())
+        },
+    );
     libtest_mimic::run(&Arguments::from_args(), vec![trial]).exit();
 }
 
@@ -83,7 +86,11 @@ fn learn_until_killed(folder: &Path) -> ! {
     loop {
         let x_m = STEP_M * random.below(POSES) as f64;
         let id = service.learn(x_m, random.below(1 << 40) as u64);
-        let learnt = service.memory.viewpoints().iter().find(|view| view.id == id);
+        let learnt = service
+            .memory
+            .viewpoints()
+            .iter()
+            .find(|view| view.id == id);
         let updates = learnt.expect("it was learnt").updates;
         // The parent reads on after the kill: what is written is not lost.
         writeln!(out, "{} {id} {updates}", monotonic_ns())
@@ -157,13 +164,19 @@ fn kill_often(lane: usize) {
                 lost_ms_max = lost_ms_max.max(killed_ns.saturating_sub(at_ns) as f64 / 1e6);
             }
         }
-        durable = content.iter().map(|(&id, found)| (id, found.updates)).collect();
+        durable = content
+            .iter()
+            .map(|(&id, found)| (id, found.updates))
+            .collect();
         service.stop();
     }
     println!(
         "lane {lane}: {} kills, {lines} frames learnt, at most the last {lost_ms_max:.0} ms lost",
         KILLS / LANES
     );
-    assert!(lines > 100 * KILLS / LANES, "only {lines} frames were learnt");
+    assert!(
+        lines > 100 * KILLS / LANES,
+        "only {lines} frames were learnt"
+    );
     assert_eq!(durable.len(), POSES);
 }

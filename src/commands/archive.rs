@@ -43,7 +43,8 @@ impl PlaceAndFile {
             self.place
         );
         let store = stored_memory(self.memory.as_deref())?;
-        store.ok_or_else(|| anyhow::anyhow!("nothing lasts in memory://: name a folder or a bucket"))
+        store
+            .ok_or_else(|| anyhow::anyhow!("nothing lasts in memory://: name a folder or a bucket"))
     }
 
     fn print(&self, done: &str, archived: Archived) {
@@ -61,7 +62,11 @@ impl Export {
     /// # Errors
     /// As [`Store::export`].
     pub async fn run(self) -> anyhow::Result<()> {
-        let archived = self.of.store()?.export(&self.of.place, &self.of.file).await?;
+        let archived = self
+            .of
+            .store()?
+            .export(&self.of.place, &self.of.file)
+            .await?;
         self.of.print("written to", archived);
         Ok(())
     }
@@ -71,7 +76,11 @@ impl Import {
     /// # Errors
     /// As [`Store::import`].
     pub async fn run(self) -> anyhow::Result<()> {
-        let archived = self.of.store()?.import(&self.of.place, &self.of.file).await?;
+        let archived = self
+            .of
+            .store()?
+            .import(&self.of.place, &self.of.file)
+            .await?;
         self.of.print("stored from", archived);
         Ok(())
     }

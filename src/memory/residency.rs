@@ -116,12 +116,15 @@ impl Memory {
             Here(usize),
             Absent(u64),
         }
-        let distance_m =
-            |view: &Pose| view_distance_m(view, world_from_camera, metres_per_radian);
-        let here = self.viewpoints.iter().enumerate().map(|(index, viewpoint)| {
-            let distance_m = distance_m(&viewpoint.world_from_camera);
-            (distance_m, Where::Here(index))
-        });
+        let distance_m = |view: &Pose| view_distance_m(view, world_from_camera, metres_per_radian);
+        let here = self
+            .viewpoints
+            .iter()
+            .enumerate()
+            .map(|(index, viewpoint)| {
+                let distance_m = distance_m(&viewpoint.world_from_camera);
+                (distance_m, Where::Here(index))
+            });
         let absent = self.absent.iter().map(|(&id, absent)| {
             let distance_m = distance_m(&absent.head.world_from_camera);
             (distance_m, Where::Absent(id))
@@ -142,9 +145,14 @@ impl Memory {
         needed
     }
 
+    /// Gives ids only beyond this one from here on.
+    pub fn reserve_ids(&mut self, id: u64) {
+        self.last_id = self.last_id.max(id);
+    }
+
     /// Learns that a viewpoint is stored. What is in RAM of an earlier state goes.
     pub fn know(&mut self, head: Head, stored: Version) {
-        self.last_id = self.last_id.max(head.id);
+        self.reserve_ids(head.id);
         if let Some(index) = self.index_of(head.id) {
             if self.marks[index].stored == Some(stored) {
                 return;

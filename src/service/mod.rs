@@ -180,7 +180,8 @@ impl Service {
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let (places, starts) = Places::new(settings, store, engine, root.into(), session, pool, failed);
+        let (places, starts) =
+            Places::new(settings, store, engine, root.into(), session, pool, failed);
         let places = Arc::new(places);
         tokio::spawn(open_stored(places.clone()));
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;

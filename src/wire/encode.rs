@@ -412,10 +412,7 @@ pub fn view(viewpoint: &Head) -> proto::View {
 }
 
 /// `views` as they are to be listed; `total` are in the memory.
-pub fn views_reply<'a>(
-    views: impl Iterator<Item = &'a Head>,
-    total: usize,
-) -> proto::ViewsReply {
+pub fn views_reply<'a>(views: impl Iterator<Item = &'a Head>, total: usize) -> proto::ViewsReply {
     proto::ViewsReply {
         views: views.map(view).collect(),
         total: total as u64,

@@ -72,7 +72,10 @@ fn a_damaged_file_is_refused_before_anything_of_it_is_stored() {
     let mut longer = whole.clone();
     longer.push(0);
     assert!(refused(&longer));
-    assert_eq!(runtime.block_on(store.places()).expect("it answers"), [PLACE]);
+    assert_eq!(
+        runtime.block_on(store.places()).expect("it answers"),
+        [PLACE]
+    );
     fs::write(&file, &whole).expect("it can be written");
     let imported = runtime.block_on(store.import("attic", &file));
     assert_eq!(imported.expect("it is whole").viewpoints, 2);
@@ -95,10 +98,16 @@ fn a_place_is_imported_over_no_other_and_under_no_service() {
     assert!(matches!(held, Err(ArchiveError::Held { .. })), "{held:?}");
     service.stop();
     let full = runtime.block_on(store.import(PLACE, &file));
-    assert!(matches!(full, Err(ArchiveError::NotEmpty { .. })), "{full:?}");
+    assert!(
+        matches!(full, Err(ArchiveError::NotEmpty { .. })),
+        "{full:?}"
+    );
     let unknown = runtime.block_on(store.export("cellar", &file));
     let sentence = unknown.expect_err("it is not there").to_string();
-    assert!(sentence.contains("cellar") && sentence.contains(PLACE), "{sentence}");
+    assert!(
+        sentence.contains("cellar") && sentence.contains(PLACE),
+        "{sentence}"
+    );
     // What is there was not touched.
     let mut service = Service::writer(&store);
     service.until_known(2);

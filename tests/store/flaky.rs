@@ -37,7 +37,8 @@ impl Flaky {
     }
 
     pub fn slow_reads(&self, delay: Duration) {
-        self.get_ms.store(delay.as_millis() as u64, Ordering::Relaxed);
+        self.get_ms
+            .store(delay.as_millis() as u64, Ordering::Relaxed);
     }
 
     fn check(&self) -> Result<()> {

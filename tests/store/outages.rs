@@ -27,7 +27,9 @@ fn a_service_goes_on_in_ram_and_stores_everything_when_the_store_is_back() {
     }
     service.until("the trouble is known", |service| {
         let status = service.store.status();
-        status.trouble.is_some_and(|trouble| trouble.contains("cut off"))
+        status
+            .trouble
+            .is_some_and(|trouble| trouble.contains("cut off"))
             && status.write_failures > 0
     });
     assert_eq!(service.store.status().pending, 6);
@@ -114,5 +116,4 @@ fn a_stop_without_a_store_ends_in_time_and_says_what_is_lost() {
     service.learn_row(2);
     let Service { store, memory, .. } = &mut service;
     assert!(!store.close(memory, Duration::from_millis(300)));
-
 }

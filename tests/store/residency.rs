@@ -88,7 +88,9 @@ fn in_steady_motion_no_frame_waits_for_the_store() {
             let x_m = from_m + 0.05 * frame as f64;
             service.store.bring(&mut service.memory, &at(x_m));
             let passed = (100_000_000 * frame as i64, at(x_m));
-            service.store.prefetch(&mut service.memory, &walker(), passed);
+            service
+                .store
+                .prefetch(&mut service.memory, &walker(), passed);
             // The pace of the frames, a tenth of what it would be.
             std::thread::sleep(Duration::from_millis(10));
             service.store.sync(&mut service.memory);
@@ -131,6 +133,12 @@ fn a_frame_does_not_wait_long_for_a_store_that_is_gone() {
     });
     // What is there is still known, and can be had again.
     service.store.bring(&mut service.memory, &at(0.0));
-    assert!(service.memory.viewpoints().iter().any(|viewpoint| viewpoint.id == 1));
+    assert!(
+        service
+            .memory
+            .viewpoints()
+            .iter()
+            .any(|viewpoint| viewpoint.id == 1)
+    );
     service.stop();
 }

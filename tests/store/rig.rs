@@ -61,7 +61,10 @@ impl Backend {
             Self::Folder(folder) => {
                 let root = folder.path().join("memory");
                 let objects = object_store::local::LocalFileSystem::new_with_prefix(root);
-                (Arc::new(objects.expect("the folder is there")), Path::default())
+                (
+                    Arc::new(objects.expect("the folder is there")),
+                    Path::default(),
+                )
             }
             Self::Objects(objects, at) => (objects.clone(), at.clone()),
         }
@@ -88,7 +91,13 @@ pub fn any_viewpoint(x_m: f64, seed: u64) -> Viewpoint {
     let camera = scene::camera(SIZE.0, SIZE.1);
     let mut random = Random(seed);
     let records = (0..camera.pixels())
-        .map(|_| Record::pack(&scene::settled([random.uniform(0.0, 255.0) as f32, 3.0, -4.0])))
+        .map(|_| {
+            Record::pack(&scene::settled([
+                random.uniform(0.0, 255.0) as f32,
+                3.0,
+                -4.0,
+            ]))
+        })
         .collect();
     let depth_m = (0..camera.pixels())
         .map(|_| random.uniform(1.0, 1.01) as f32)

@@ -95,7 +95,10 @@ impl Weed {
             if matches!((made, written), (Some(200 | 409), Some(200))) {
                 return;
             }
-            assert!(Instant::now() < end, "SeaweedFS answers {made:?} {written:?}");
+            assert!(
+                Instant::now() < end,
+                "SeaweedFS answers {made:?} {written:?}"
+            );
             std::thread::sleep(Duration::from_millis(100));
         }
     }

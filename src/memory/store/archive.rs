@@ -26,7 +26,7 @@ use crc_fast::{CrcAlgorithm, Digest};
 use object_store::Error;
 
 use super::{
-    Store,
+    Store, StoreError,
     form::{self, FormError, Label},
     lease::{EXPIRES_AFTER, Lease, Looked, RENEW_EVERY, Watcher, own_name},
     shelf::Shelf,
@@ -42,15 +42,17 @@ const LOOK_EVERY: Duration = Duration::from_millis(500);
 
 #[derive(Debug, thiserror::Error)]
 pub enum ArchiveError {
-    #[error("nothing is stored of place {place}; there is: {}", if known.is_empty() { "nothing" } else { known })]
+    #[error("nothing is stored of place {place}; there is: {known}")]
     Unknown { place: String, known: String },
-    #[error("{}: {error}", file.display())]
+    #[error("{}: {error}", .file.display())]
     File { file: PathBuf, error: io::Error },
-    #[error("{}: {what}: this is no exported place, or it is damaged", file.display())]
+    #[error("{}: {what}: this is no exported place, or it is damaged", .file.display())]
     Damaged { file: PathBuf, what: String },
     #[error("place {place} has viewpoints already: import under another name, or forget it first")]
     NotEmpty { place: String },
-    #[error("place {place} is written by {holder}: stop that service first, or import under another name")]
+    #[error(
+        "place {place} is written by {holder}: stop that service first, or import under another name"
+    )]
     Held { place: String, holder: String },
     #[error("the place was taken over by another service meanwhile; what was imported is removed")]
     Lost,
@@ -61,7 +63,9 @@ pub enum ArchiveError {
         error: FormError,
     },
     #[error("the store cannot be used: {0}")]
-    Store(#[from] Error),
+    Objects(#[from] Error),
+    #[error(transparent)]
+    Store(#[from] StoreError),
 }
 
 /// What was exported or imported.
@@ -86,7 +90,10 @@ impl Store {
         let shelf = self.shelf(place);
         let mut states = newest(&shelf).await?;
         if states.is_empty() {
-            let known = self.places().await.unwrap_or_default().join(", ");
+            let mut known = self.places().await?.join(", ");
+            if known.is_empty() {
+                known = "nothing".to_owned();
+            }
             let place = place.to_owned();
             return Err(ArchiveError::Unknown { place, known });
         }
@@ -247,8 +254,7 @@ async fn fill(
                 version,
                 settings_hash: read.label.settings_hash,
             };
-            let object =
-                form::relabel(&object, &label).map_err(|error| source.damaged(&error))?;
+            let object = form::relabel(&object, &label).map_err(|error| source.damaged(&error))?;
             archived.viewpoints += 1;
             archived.bytes += object.len() as u64;
             // Before: whether a put that failed has left something is not known.

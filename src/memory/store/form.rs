@@ -69,10 +69,19 @@ pub enum FormError {
     Length { got: u64, said: u64 },
     #[error("the checksum of its {part} is wrong")]
     Checksum { part: &'static str },
+    #[error("its object is larger than image_pixels_max allows")]
+    TooLong,
     #[error("its {0} is impossible")]
     Value(&'static str),
     #[error("its image of {pixels} pixels is larger than image_pixels_max = {most}")]
     Large { pixels: u64, most: usize },
+}
+
+impl FormError {
+    /// False for what another program, or this one with other settings, can read.
+    pub fn is_damage(&self) -> bool {
+        !matches!(self, Self::Version(_) | Self::Large { .. } | Self::TooLong)
+    }
 }
 
 /// A head as read, and where the planes lie.
@@ -169,10 +178,7 @@ pub fn decode_head(bytes: &[u8]) -> Result<ReadHead, FormError> {
     let version = reader.u32()?;
     let head_bytes = reader.u32()? as usize;
     let object_bytes = reader.u64()?;
-    if version != VERSION {
-        return Err(FormError::Version(version));
-    }
-    if head_bytes > HEAD_BYTES_MAX || head_bytes < PREFIX_BYTES + CHECKSUM_BYTES {
+    if !(PREFIX_BYTES + CHECKSUM_BYTES..=HEAD_BYTES_MAX).contains(&head_bytes) {
         return Err(FormError::Value("head's length"));
     }
     let Some(head) = bytes.get(..head_bytes) else {
@@ -181,6 +187,10 @@ pub fn decode_head(bytes: &[u8]) -> Result<ReadHead, FormError> {
     let (content, sum) = head.split_at(head_bytes - CHECKSUM_BYTES);
     if sum != checksum(content).to_le_bytes() {
         return Err(FormError::Checksum { part: "head" });
+    }
+    // Up to here every version is the same, so that a damaged one is no other one.
+    if version != VERSION {
+        return Err(FormError::Version(version));
     }
     let mut reader = Reader(&content[PREFIX_BYTES..]);
     let id = reader.u64()?;

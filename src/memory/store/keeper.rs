@@ -13,7 +13,7 @@ use super::{
     Backoff,
     form::{self, FormError},
     lease::{Lease, Looked, RENEW_EVERY, Watcher},
-    loader::{self, note_damaged},
+    loader::{self, note_unreadable},
     place::{Known, NAMES_MAX, News, Role, Shared},
     shelf::{Listed, Result},
     writer,
@@ -57,7 +57,11 @@ pub async fn keep(shared: Arc<Shared>) {
             break;
         }
         // A lease must not expire because the store was away for a moment.
-        let pause = if lease.is_some() { pause.min(RENEW_EVERY) } else { pause };
+        let pause = if lease.is_some() {
+            pause.min(RENEW_EVERY)
+        } else {
+            pause
+        };
         // Whichever comes first.
         let _ = tokio::time::timeout(pause, shared.for_keeper.notified()).await;
     }
@@ -67,7 +71,10 @@ pub async fn keep(shared: Arc<Shared>) {
     if let Some(lease) = lease
         && let Err(error) = lease.release(&shared.shelf).await
     {
-        tracing::warn!(place = &*shared.place, "the lease could not be released: {error}");
+        tracing::warn!(
+            place = &*shared.place,
+            "the lease could not be released: {error}"
+        );
     }
     shared.lock().closed = true;
     shared.tell_worker();
@@ -110,7 +117,9 @@ fn lost(shared: &Shared) {
     state.loaded.clear();
     state.catalogue.clear();
     state.news.push(News::Reset);
+    state.stale = true;
     drop(state);
+    shared.for_keeper.notify_one();
     tracing::error!(
         place = &*shared.place,
         "another service has taken this place over; {count} changes were not stored and are lost"
@@ -144,9 +153,18 @@ async fn read_and_take(shared: &Shared, seeker: &mut Seeker) -> Result<Option<Le
         refresh(shared).await?;
         seeker.refreshed = Some((Instant::now(), began.elapsed()));
     }
-    let epochs = shared.lock().catalogue.values().map(|known| known.version.epoch).max();
+    let epochs = shared
+        .lock()
+        .catalogue
+        .values()
+        .map(|known| known.version.epoch)
+        .max();
     let epoch_min = epochs.unwrap_or(0) + 1;
-    match seeker.watcher.look(&shared.shelf, &shared.name, epoch_min).await? {
+    match seeker
+        .watcher
+        .look(&shared.shelf, &shared.name, epoch_min)
+        .await?
+    {
         Looked::Held(holder) => {
             if first {
                 tracing::info!(
@@ -208,19 +226,26 @@ async fn tidy(shared: &Shared, lease: &Lease) -> Result<()> {
 
 /// Moves damaged objects away from the others; how many. Only for who writes the place.
 async fn set_aside(shared: &Shared) -> Result<usize> {
-    let damaged: Vec<(u64, Version)> = shared.lock().damaged.keys().copied().collect();
+    let damaged: Vec<(u64, Version)> = {
+        let state = shared.lock();
+        let damaged = state
+            .unreadable
+            .iter()
+            .filter(|(_, found)| found.is_damaged);
+        damaged.map(|(&key, _)| key).collect()
+    };
     for &(id, version) in &damaged {
         let path = match shared.shelf.set_aside(id, version).await {
             // Somebody else did, or deleted it.
             Err(Error::NotFound { .. }) => {
-                shared.lock().damaged.remove(&(id, version));
+                shared.lock().unreadable.remove(&(id, version));
                 continue;
             }
             moved => moved?,
         };
         tracing::error!(place = &*shared.place, "what is damaged is kept as {path}");
         let mut state = shared.lock();
-        state.damaged.remove(&(id, version));
+        state.unreadable.remove(&(id, version));
         let counters = &mut state.counters;
         counters.damaged += 1;
         if counters.damaged_names.len() < NAMES_MAX {
@@ -241,9 +266,10 @@ struct Read {
 async fn refresh(shared: &Shared) -> Result<Read> {
     let listing = shared.shelf.list().await?;
     let mut states: BTreeMap<u64, Vec<Listed>> = BTreeMap::new();
-    let damaged = shared.lock().damaged.clone();
+    let unreadable = shared.lock().unreadable.clone();
+    let id_max = listing.viewpoints.iter().map(|listed| listed.id).max();
     for listed in listing.viewpoints {
-        if !damaged.contains_key(&(listed.id, listed.version)) {
+        if !unreadable.contains_key(&(listed.id, listed.version)) {
             states.entry(listed.id).or_default().push(listed);
         }
     }
@@ -278,7 +304,7 @@ async fn refresh(shared: &Shared) -> Result<Read> {
         read.superseded.extend(newest.superseded);
         kept.extend(newest.vanished);
         for (id, version, error) in newest.damaged {
-            note_damaged(shared, id, version, &error);
+            note_unreadable(shared, id, version, &error);
         }
         if let Some((entry, settings_hash)) = newest.found {
             other_settings += usize::from(settings_hash != shared.options.settings_hash);
@@ -289,6 +315,7 @@ async fn refresh(shared: &Shared) -> Result<Read> {
     found.sort_by_key(|entry| entry.head.id);
 
     let mut state = shared.lock();
+    state.news.push(News::Taken(id_max.unwrap_or(0)));
     let found_ids: BTreeSet<u64> = found.iter().map(|entry| entry.head.id).collect();
     let gone: Vec<u64> = known
         .keys()
@@ -333,7 +360,9 @@ async fn newest_readable(shared: &Shared, states: Vec<Listed>) -> Result<Newest>
             continue;
         }
         if bytes == 0 {
-            newest.damaged.push((id, version, FormError::Short { got: 0 }));
+            newest
+                .damaged
+                .push((id, version, FormError::Short { got: 0 }));
             continue;
         }
         let got = match shared.shelf.get_head(id, version).await {

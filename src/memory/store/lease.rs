@@ -137,9 +137,7 @@ impl Lease {
     pub async fn renew(&mut self, shelf: &Shelf) -> Result<bool> {
         let began = Instant::now();
         self.content.beat += 1;
-        shelf
-            .renew_lease(self.epoch, self.content.bytes())
-            .await?;
+        shelf.renew_lease(self.epoch, self.content.bytes()).await?;
         let epochs = shelf.lease_epochs().await?;
         if epochs.iter().any(|&epoch| epoch > self.epoch) {
             return Ok(false);

@@ -9,7 +9,7 @@ use tokio::task::{JoinSet, spawn_blocking};
 use super::{
     Backoff,
     form::{self, FormError},
-    place::{News, Shared},
+    place::{News, Shared, Unreadable},
     planes,
 };
 use crate::memory::Version;
@@ -90,7 +90,7 @@ async fn load_one(shared: Arc<Shared>, id: u64, version: Version) -> bool {
             })
             .await
         }
-        Ok(None) => Ok(Err(FormError::Value("size"))),
+        Ok(None) => Ok(Err(FormError::TooLong)),
         Err(Error::NotFound { .. }) => {
             // Somebody else has written or removed it.
             shared.forget(id);
@@ -115,7 +115,7 @@ async fn load_one(shared: Arc<Shared>, id: u64, version: Version) -> bool {
             state.news.push(News::Loaded(Arc::new(viewpoint), version));
         }
         Ok(Err(error)) => {
-            note_damaged(&shared, id, version, &error);
+            note_unreadable(&shared, id, version, &error);
             shared.forget(id);
         }
         Err(error) => tracing::error!("reading a viewpoint failed: {error}"),
@@ -124,13 +124,22 @@ async fn load_one(shared: Arc<Shared>, id: u64, version: Version) -> bool {
     true
 }
 
-/// Says that an object is damaged, and keeps it from being read again. The keeper sets it aside.
-pub fn note_damaged(shared: &Shared, id: u64, version: Version, why: &FormError) {
+/// Says that an object cannot be read, and keeps it from being read again. If it is damaged the keeper sets it aside.
+pub fn note_unreadable(shared: &Shared, id: u64, version: Version, why: &FormError) {
     let name = shared.shelf.viewpoint(id, version).to_string();
-    tracing::error!(
-        place = &*shared.place,
-        "viewpoint {id} is damaged and is not loaded: {why}; it is {name}"
-    );
-    shared.lock().damaged.insert((id, version), name);
+    let is_damaged = why.is_damage();
+    if is_damaged {
+        tracing::error!(
+            place = &*shared.place,
+            "viewpoint {id} is damaged and is not loaded: {why}; it is {name}"
+        );
+    } else {
+        tracing::warn!(
+            place = &*shared.place,
+            "viewpoint {id} is left as it is and not loaded: {why}; it is {name}"
+        );
+    }
+    let unreadable = Unreadable { name, is_damaged };
+    shared.lock().unreadable.insert((id, version), unreadable);
     shared.for_keeper.notify_one();
 }

@@ -42,8 +42,8 @@ use std::{path::PathBuf, sync::Arc, time::Duration};
 
 use futures_util::StreamExt;
 use object_store::{
-    BackoffConfig, ClientOptions, ObjectStore, RetryConfig,
-    aws::AmazonS3Builder, local::LocalFileSystem, path::Path,
+    BackoffConfig, ClientOptions, ObjectStore, RetryConfig, aws::AmazonS3Builder,
+    local::LocalFileSystem, path::Path,
 };
 use url::Url;
 
@@ -63,7 +63,9 @@ pub enum StoreError {
         "--memory {0}: write it as file:///folder, s3://bucket/prefix, or memory:// for a memory that ends with the service"
     )]
     Url(String),
-    #[error("--memory: this user has no home and so no folder for data: name one, as file:///folder")]
+    #[error(
+        "--memory: this user has no home and so no folder for data: name one, as file:///folder"
+    )]
     NoHome,
     #[error("--memory {folder}: the folder cannot be made or opened: {error}")]
     Folder {

@@ -90,7 +90,9 @@ pub enum Role {
     #[default]
     Unread,
     /// Another service writes the place; this one answers questions.
-    Reader { holder: String },
+    Reader {
+        holder: String,
+    },
     Writer,
 }
 
@@ -114,6 +116,8 @@ pub struct StoreStatus {
     /// Objects that could not be read, and where the first of them are.
     pub damaged: u64,
     pub damaged_names: Vec<String>,
+    /// Whole objects that are left as they are: of a later version of the form, or too large for these settings.
+    pub left_unread: usize,
     /// Changes that are not stored yet, and the age of the oldest.
     pub pending: usize,
     pub pending_s: f64,
@@ -152,11 +156,20 @@ pub(super) struct Known {
     pub bytes: u64,
 }
 
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Unreadable {
+    pub name: String,
+    /// Else it is of another version of the form, or too large for these settings.
+    pub is_damaged: bool,
+}
+
 /// What the worker has to learn, in this order.
 #[derive(Debug)]
 pub(super) enum News {
     /// Everything is as the store says from here on.
     Reset,
+    /// Ids up to this one are not to be given again.
+    Taken(u64),
     Known(Vec<(Head, Version)>),
     Gone(u64),
     Loaded(Arc<Viewpoint>, Version),
@@ -181,8 +194,8 @@ pub(super) struct State {
     /// Loaded, among the news.
     pub loaded: BTreeSet<u64>,
     pub news: Vec<News>,
-    /// Objects that cannot be read and are not set aside, by their names.
-    pub damaged: BTreeMap<(u64, Version), String>,
+    /// Objects that cannot be read, as long as they are among the others.
+    pub unreadable: BTreeMap<(u64, Version), Unreadable>,
     /// The store is not as the catalogue says.
     pub stale: bool,
     /// What went wrong, by who noticed.
@@ -199,7 +212,9 @@ impl State {
 
     /// Whether the lease of this epoch still allows to write.
     pub fn may_write(&self, epoch: u64) -> bool {
-        let trusted = self.trusted_until.is_some_and(|until| Instant::now() < until);
+        let trusted = self
+            .trusted_until
+            .is_some_and(|until| Instant::now() < until);
         self.role == Role::Writer && self.epoch == epoch && trusted
     }
 }
@@ -248,10 +263,16 @@ impl Shared {
         drop(state);
         match (before, what) {
             (None, Some(what)) => {
-                tracing::warn!(place = &*self.place, "the stored memory has trouble: {what}");
+                tracing::warn!(
+                    place = &*self.place,
+                    "the stored memory has trouble: {what}"
+                );
             }
             (Some(_), None) => {
-                tracing::info!(place = &*self.place, "the stored memory is well again ({who})");
+                tracing::info!(
+                    place = &*self.place,
+                    "the stored memory is well again ({who})"
+                );
             }
             _ => {}
         }
@@ -361,6 +382,7 @@ impl PlaceStore {
         for item in news {
             match item {
                 News::Reset => memory.reset(),
+                News::Taken(id) => memory.reserve_ids(id),
                 News::Known(known) => {
                     for (head, version) in known {
                         memory.know(head, version);
@@ -448,6 +470,7 @@ impl PlaceStore {
                     state.wanted.push_front(id);
                 }
             }
+            state.wanted.truncate(LOADS_MAX);
             let is_hopeless = state.trouble.contains_key(loader::READING);
             drop(state);
             self.shared.for_loader.notify_one();
@@ -493,6 +516,12 @@ impl PlaceStore {
     pub fn status(&self) -> StoreStatus {
         let state = self.shared.lock();
         let oldest = state.pending.values().map(|pending| pending.since).min();
+        let found = state.unreadable.values();
+        let damaged: Vec<&String> = found
+            .filter(|found| found.is_damaged)
+            .map(|found| &found.name)
+            .collect();
+        let left_unread = state.unreadable.len() - damaged.len();
         StoreStatus {
             role: match state.role {
                 Role::Unread => "unread",
@@ -507,12 +536,12 @@ impl PlaceStore {
             epoch: state.epoch,
             stored_viewpoints: state.catalogue.len(),
             stored_bytes: state.catalogue.values().map(|known| known.bytes).sum(),
-            damaged: state.counters.damaged + state.damaged.len() as u64,
+            damaged: state.counters.damaged + damaged.len() as u64,
             damaged_names: {
                 let aside = state.counters.damaged_names.iter();
-                let others = aside.chain(state.damaged.values());
-                others.take(NAMES_MAX).cloned().collect()
+                aside.chain(damaged).take(NAMES_MAX).cloned().collect()
             },
+            left_unread,
             pending: state.pending.len() + state.writing,
             pending_s: oldest.map_or(0.0, |since| since.elapsed().as_secs_f64()),
             ..state.counters.clone()

@@ -46,7 +46,9 @@ pub fn pack(records: &[Record], depth_m: &[f32]) -> Vec<u8> {
                 }
                 _ => divide(
                     bytes,
-                    depth_m.iter().map(|depth_m| (depth_m.to_bits() >> 16) as u16),
+                    depth_m
+                        .iter()
+                        .map(|depth_m| (depth_m.to_bits() >> 16) as u16),
                 ),
             }
         }

@@ -98,10 +98,10 @@ async fn write_batch(
     while let Some((id, pending, done)) = writes.next().await {
         match done {
             Ok(Some(known)) => superseded.extend(note_stored(shared, known, pending.since)),
-            Ok(None) => put_back(shared, id, pending),
+            Ok(None) => put_back(shared, epoch, id, pending),
             Err(error) => {
                 trouble = Some(error.to_string());
-                put_back(shared, id, pending);
+                put_back(shared, epoch, id, pending);
             }
         }
     }
@@ -118,7 +118,7 @@ async fn write_batch(
     if !matches!(is_removed, Ok(true)) {
         superseded.extend(gone);
         for (id, pending) in removed {
-            put_back(shared, id, pending);
+            put_back(shared, epoch, id, pending);
         }
     }
     if let Err(error) = is_removed {
@@ -212,9 +212,12 @@ async fn remove(
     Ok(true)
 }
 
-/// What changed since then stays; it has been lacking for longer.
-fn put_back(shared: &Shared, id: u64, pending: Pending) {
+/// What changed since then stays; it has been lacking for longer. What another service has taken is not ours to write.
+fn put_back(shared: &Shared, epoch: u64, id: u64, pending: Pending) {
     let mut state = shared.lock();
+    if state.role != Role::Writer || state.epoch != epoch {
+        return;
+    }
     match state.pending.get_mut(&id) {
         Some(newer) => newer.since = pending.since,
         None => {
