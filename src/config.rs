@@ -119,8 +119,12 @@ pub struct Settings {
     pub viewpoints: usize,
     /// Home distance from which `grow_home` appends, metres of view distance.
     pub grow_distance_m: f64,
-    /// Budget of the viewpoints of one place, bytes. When it is full the nearest of the selected is replaced.
+    /// Budget of one place's viewpoints in RAM, bytes. When it is full the nearest of the selected is replaced.
+    /// Where viewpoints are stored, those that are not needed leave RAM first.
     pub memory_bytes: usize,
+    /// A crash loses at most what was learnt in the last so many seconds; a clean stop loses nothing. Less writes what
+    /// changes often more often.
+    pub write_behind_s: f64,
 
     pub evidence: Evidence,
     /// Nats of evidence from which a block seeds a region. 6 separates well on every recording measured.
@@ -215,6 +219,7 @@ impl Settings {
             viewpoints: 200,
             grow_distance_m: 0.025,
             memory_bytes: MEMORY_BYTES,
+            write_behind_s: 2.0,
             evidence: Evidence::BlockMedian,
             surprise_threshold: 6.0,
             region_fraction: 0.3,
@@ -340,6 +345,7 @@ impl Settings {
         within("viewpoints", self.viewpoints, 1, 1_000_000)?;
         within("grow_distance_m", self.grow_distance_m, 0.0, 100.0)?;
         within("memory_bytes", self.memory_bytes, 1 << 20, 1 << 46)?;
+        within("write_behind_s", self.write_behind_s, 0.1, 3600.0)?;
         within("surprise_threshold", self.surprise_threshold, 0.01, 1e6)?;
         within("region_fraction", self.region_fraction, 0.01, 1.0)?;
         within("border_px", self.border_px, 0, 1000)?;
@@ -381,6 +387,8 @@ fn robot_table<'a>(settings: &'a mut toml::Table, robot: &str) -> Option<&'a mut
 
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
+    #[error("{0}")]
+    Memory(String),
     #[error("settings: {0}")]
     File(toml::de::Error),
     #[error("{file}: {error}")]

@@ -41,7 +41,7 @@ pub mod pipeline;
 /// Where interpolation and surprise are computed.
 pub mod engine;
 
-/// The viewpoints of a place, their growth and replacement.
+/// The viewpoints of a place, their growth and replacement, and where they last.
 pub mod memory;
 
 /// What is computed: plain functions over values and rows.

@@ -15,7 +15,6 @@ use crate::{
     isa::Isa,
     memory::{Memory, forget::Forgetting, visit::Visit},
     model::{
-        belief::Record,
         camera::Intrinsics,
         event::Event,
         frame::{DepthSource, Frame, FrameError, Sides, Source},
@@ -44,6 +43,9 @@ const DEPTH_COSTS_MAX: usize = 1 << 28;
 /// Labels between neighbours that still are one surface: a slanted one moves by one at a time, and refinement below a
 /// label adds to that on both sides.
 const LABELS_JOINED: f32 = 1.5;
+
+/// One to be filled, and one that may still be on its way to where it is stored.
+const SPARES_MAX: usize = 2;
 
 /// Everything that was computed for the last frame, until the next.
 #[derive(Debug, Clone, Default)]
@@ -98,9 +100,6 @@ struct Workspace {
     observation: Observation,
     selected: Vec<usize>,
     blocks: BlockMap,
-    mesh: Mesh,
-    records: Vec<Record>,
-    coarse: Coarse,
 }
 
 pub struct Pipeline {
@@ -111,6 +110,8 @@ pub struct Pipeline {
     refiner: PoseRefiner,
     update_rules: UpdateRules,
     memory: Memory,
+    /// Viewpoints that were replaced: their memory is used again.
+    spares: ArrayVec<Arc<Viewpoint>, SPARES_MAX>,
     cameras: HashMap<Source, Camera>,
     events: Events,
     last_region_id: u64,
@@ -148,6 +149,7 @@ impl Pipeline {
             refiner: PoseRefiner::new(isa),
             update_rules: UpdateRules::new(&settings),
             memory: Memory::default(),
+            spares: ArrayVec::new(),
             cameras: HashMap::new(),
             events: Events::default(),
             last_region_id: 0,
@@ -165,6 +167,11 @@ impl Pipeline {
 
     pub fn memory(&self) -> &Memory {
         &self.memory
+    }
+
+    /// For who stores it, and for who forgets some of it.
+    pub fn memory_mut(&mut self) -> &mut Memory {
+        &mut self.memory
     }
 
     /// Of the last frame that was processed or evaluated.
@@ -279,27 +286,19 @@ impl Pipeline {
 
     /// Makes the posterior of the frame that was looked at a viewpoint and returns its id.
     fn remember(&mut self, frame: &Frame, world_from_camera: &Pose) -> u64 {
+        let mut viewpoint = self.spare(frame);
         let work = &mut self.workspace;
-        let mut mesh = std::mem::take(&mut work.mesh);
-        let mut coarse = std::mem::take(&mut work.coarse);
-        let mut records = std::mem::take(&mut work.records);
-        mesh.intrinsics = frame.intrinsics;
-        std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
-        records.clear();
-        records.extend_from_slice(&self.maps.score.posterior);
+        let fresh = Arc::get_mut(&mut viewpoint).expect("a spare has one owner");
+        fresh.world_from_camera = *world_from_camera;
+        fresh.world_from_home = *world_from_camera;
+        fresh.source.clone_from(&frame.source);
+        fresh.stamp_ns = frame.stamp_ns;
+        fresh.mesh.intrinsics = frame.intrinsics;
+        std::mem::swap(&mut fresh.mesh.depth_m, &mut work.depth_m);
+        fresh.records.clear();
+        fresh.records.extend_from_slice(&self.maps.score.posterior);
         self.engine
-            .prepare(&mut mesh, &records, &mut coarse, work.cut);
-        let viewpoint = Viewpoint {
-            coarse,
-            id: 0,
-            world_from_camera: *world_from_camera,
-            world_from_home: *world_from_camera,
-            mesh,
-            records,
-            source: frame.source.clone(),
-            stamp_ns: frame.stamp_ns,
-            updates: 0,
-        };
+            .prepare(&mut fresh.mesh, &fresh.records, &mut fresh.coarse, work.cut);
         let slot = self.memory.slot(
             &work.selected,
             world_from_camera,
@@ -310,12 +309,34 @@ impl Pipeline {
         let written = self.memory.viewpoints().iter().find(|view| view.id == id);
         self.engine
             .remember(written.expect("it was written just now"));
-        if let Some(old) = old {
-            work.mesh = old.mesh;
-            work.coarse = old.coarse;
-            work.records = old.records;
+        if let Some(old) = old
+            && !self.spares.is_full()
+        {
+            self.spares.push(old);
         }
         id
+    }
+
+    /// A viewpoint to be filled in: one that was replaced and is not being stored any more, or a new one.
+    fn spare(&mut self, frame: &Frame) -> Arc<Viewpoint> {
+        let free = self
+            .spares
+            .iter_mut()
+            .position(|spare| Arc::get_mut(spare).is_some());
+        match free {
+            Some(index) => self.spares.swap_remove(index),
+            None => Arc::new(Viewpoint {
+                id: 0,
+                world_from_camera: frame.world_from_camera,
+                world_from_home: frame.world_from_camera,
+                mesh: Mesh::default(),
+                records: Vec::new(),
+                coarse: Coarse::default(),
+                source: frame.source.clone(),
+                stamp_ns: frame.stamp_ns,
+                updates: 0,
+            }),
+        }
     }
 
     /// Compares a frame with the memory and changes nothing but [`Self::maps`]. Its regions have no ids.

@@ -2,6 +2,8 @@
 
 mod reference;
 
+use std::sync::Arc;
+
 use nalgebra::{Point3, Vector3};
 use reference::{
     pool,
@@ -94,7 +96,7 @@ fn point_in_world(view: &Viewpoint, pixel: usize) -> Point3<f64> {
 #[test]
 fn a_forgotten_sphere_is_unseen_and_everything_else_stays_bit_for_bit() {
     let mut pipeline = learnt();
-    let before: Vec<Viewpoint> = pipeline.memory().viewpoints().to_vec();
+    let before: Vec<Arc<Viewpoint>> = pipeline.memory().viewpoints().to_vec();
     let forgotten = forget(&mut pipeline, in_region(HOLE));
     let unknown = Record::pack(&Belief::unknown());
     let mut pixels = 0;
@@ -145,7 +147,7 @@ fn a_forgotten_sphere_is_unseen_and_everything_else_stays_bit_for_bit() {
 #[test]
 fn nothing_of_the_forgotten_is_left_in_what_poses_are_refined_against() {
     let mut pipeline = learnt();
-    let before: Vec<Viewpoint> = pipeline.memory().viewpoints().to_vec();
+    let before: Vec<Arc<Viewpoint>> = pipeline.memory().viewpoints().to_vec();
     forget(&mut pipeline, in_region(HOLE));
     for (old, new) in before.iter().zip(pipeline.memory().viewpoints()) {
         let width = old.coarse.mesh.intrinsics.width;

@@ -34,7 +34,7 @@ fn learn(memory: &mut Memory, x_m: f64, settings: &Settings) -> (Slot, u64) {
     let viewpoint = viewpoint_at(x_m);
     let slot = memory.slot(&selected, &at(x_m), viewpoint.bytes(), settings);
     let id = memory.write(slot, viewpoint);
-    let bytes: usize = memory.viewpoints().iter().map(Viewpoint::bytes).sum();
+    let bytes: usize = memory.viewpoints().iter().map(|held| held.bytes()).sum();
     assert_eq!(memory.bytes(), bytes);
     (slot, id)
 }

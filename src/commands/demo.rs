@@ -34,7 +34,7 @@ impl Demo {
     /// # Errors
     /// As [`Service::start`] and [`fleet::drive`].
     pub async fn run(self) -> anyhow::Result<()> {
-        let mut options = self.options.options()?;
+        let mut options = self.options.options(false)?;
         if options.zenoh.listen.is_empty() {
             // The robots are in this process; others may be let in with --listen.
             options.zenoh.listen = vec!["tcp/127.0.0.1:0".to_owned()];

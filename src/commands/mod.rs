@@ -1,5 +1,7 @@
 //! How the program is started: one file a command.
 
+pub mod archive;
+
 pub mod demo;
 
 pub mod evaluate;
@@ -36,6 +38,8 @@ enum Command {
     Replay(replay::Replay),
     Evaluate(evaluate::EvaluateArgs),
     Query(query::Query),
+    Export(archive::Export),
+    Import(archive::Import),
 }
 
 impl Arguments {
@@ -49,6 +53,8 @@ impl Arguments {
             Command::Replay(replay) => replay.run().await,
             Command::Evaluate(evaluate) => evaluate::run(evaluate),
             Command::Query(query) => query.run().await,
+            Command::Export(export) => export.run().await,
+            Command::Import(import) => import.run().await,
         }
     }
 }

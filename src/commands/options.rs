@@ -5,6 +5,7 @@ use std::{net::SocketAddr, path::PathBuf};
 use crate::{
     config::{ConfigError, Preset, Settings},
     engine::EngineKind,
+    memory::store::Store,
     service::{
         self,
         access::{HttpAccess, Token},
@@ -52,6 +53,10 @@ pub struct ServiceOptions {
     /// Where recall and surprise are computed.
     #[arg(long, value_enum, default_value_t)]
     pub engine: EngineKind,
+    /// Where memories last: file:///folder, s3://bucket/prefix with the usual AWS_ variables, or memory:// for memories
+    /// that end with the program. Without it serve keeps them in this user's data folder, and demo nowhere.
+    #[arg(long, value_name = "URL")]
+    pub memory: Option<String>,
     /// Address to serve HTTP on; off for none.
     #[arg(long, value_name = "ADDR", default_value = "127.0.0.1:8080", value_parser = http)]
     pub http: Http,
@@ -70,10 +75,14 @@ pub struct ServiceOptions {
 
 impl ServiceOptions {
     /// # Errors
-    /// Settings that are wrong, or a token that cannot be used.
-    pub fn options(self) -> Result<service::Options, ConfigError> {
+    /// Settings that are wrong, a token that cannot be used, or a memory that cannot be opened.
+    pub fn options(self, lasting: bool) -> Result<service::Options, ConfigError> {
         Ok(service::Options {
             settings: self.settings.settings()?,
+            store: match &self.memory {
+                None if !lasting => None,
+                url => stored_memory(url.as_deref())?,
+            },
             engine: self.engine,
             root: self.root,
             http: self.http.0,
@@ -88,6 +97,18 @@ impl ServiceOptions {
             zenoh: self.zenoh,
         })
     }
+}
+
+/// Where memories last: at a URL, or else in this user's data folder. `None`: nowhere.
+///
+/// # Errors
+/// A memory that cannot be opened.
+pub fn stored_memory(url: Option<&str>) -> Result<Option<Store>, ConfigError> {
+    let store = match url {
+        Some(url) => Store::open(url),
+        None => Store::in_data_folder().map(Some),
+    };
+    store.map_err(|error| ConfigError::Memory(error.to_string()))
 }
 
 /// `None`: off.

@@ -19,7 +19,7 @@ impl Serve {
     /// As [`service::serve`].
     pub async fn run(self) -> anyhow::Result<()> {
         let stop = stop_signal()?;
-        Ok(service::serve(self.options.options()?, stop).await?)
+        Ok(service::serve(self.options.options(true)?, stop).await?)
     }
 }
 

@@ -8,12 +8,15 @@
 //! It can be done in steps with frames in between: what frames write meanwhile is gone through as well, so that in the
 //! end nothing of the region is held by anybody, also not what a frame brought from one viewpoint into another.
 
-use std::{collections::HashMap, ops::Range};
+use std::{collections::HashMap, ops::Range, sync::Arc};
 
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-use crate::{memory::Memory, model::viewpoint::Viewpoint};
+use crate::{
+    memory::Memory,
+    model::viewpoint::{Head, Viewpoint},
+};
 
 /// Part of the world, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -64,13 +67,13 @@ pub struct Forgotten {
 }
 
 /// How often a viewpoint had been updated, and with what stamp, when it was gone through.
-type Version = (u64, i64);
+type Written = (u64, i64);
 
 /// Forgetting under way.
 #[derive(Debug)]
 pub struct Forgetting {
     what: Forget,
-    gone_through: HashMap<u64, Version>,
+    gone_through: HashMap<u64, Written>,
     forgotten: Forgotten,
 }
 
@@ -88,69 +91,78 @@ impl Forgetting {
         &self.forgotten
     }
 
-    fn is_pending(&self, viewpoint: &Viewpoint) -> bool {
-        let in_span = |span: &Range<i64>| span.contains(&viewpoint.stamp_ns);
+    fn is_pending(&self, id: u64, written: Written) -> bool {
+        let in_span = |span: &Range<i64>| span.contains(&written.1);
         self.what.span_ns.as_ref().is_none_or(in_span)
-            && self.gone_through.get(&viewpoint.id) != Some(&version(viewpoint))
+            && self.gone_through.get(&id) != Some(&written)
+    }
+
+    fn is_head_pending(&self, head: &Head) -> bool {
+        self.is_pending(head.id, (head.updates, head.stamp_ns))
     }
 }
 
-fn version(viewpoint: &Viewpoint) -> Version {
+fn written(viewpoint: &Viewpoint) -> Written {
     (viewpoint.updates, viewpoint.stamp_ns)
 }
 
 impl Memory {
     /// Goes on forgetting, over at most so many viewpoints; whether all is done. Uses the threads it is called on.
     pub fn forget(&mut self, forgetting: &mut Forgetting, viewpoints_max: usize) -> bool {
-        let mut pending: Vec<(usize, &mut Viewpoint)> = self
+        let region = forgetting.what.region;
+        if region.is_none() {
+            // What goes whole need not be loaded; its pixels are not counted.
+            let absent = self.absent_to_forget(forgetting, usize::MAX);
+            forgetting.forgotten.removed.extend(&absent);
+            self.remove(|head| absent.binary_search(&head.id).is_ok());
+        }
+        let mut pending: Vec<(usize, &mut Arc<Viewpoint>)> = self
             .viewpoints
             .iter_mut()
             .enumerate()
-            .filter(|(_, viewpoint)| forgetting.is_pending(viewpoint))
+            .filter(|(_, viewpoint)| forgetting.is_pending(viewpoint.id, written(viewpoint)))
             .take(viewpoints_max)
             .collect();
         let is_last = pending.len() < viewpoints_max;
-        let region = forgetting.what.region;
         // Index, id, version, pixels forgotten, whether anything is left.
-        let cleared: Vec<(usize, u64, Version, u64, bool)> = pending
+        let cleared: Vec<(usize, u64, Written, u64, bool)> = pending
             .par_iter_mut()
             .map(|(index, viewpoint)| {
                 let pixels = clear(viewpoint, region);
                 let left = region.is_some() && !(pixels > 0 && viewpoint.is_empty());
-                (*index, viewpoint.id, version(viewpoint), pixels, left)
+                (*index, viewpoint.id, written(viewpoint), pixels, left)
             })
             .collect();
         let mut gone = Vec::new();
-        for (index, id, version, pixels, left) in cleared {
+        for (index, id, written, pixels, left) in cleared {
             forgetting.forgotten.pixels += pixels;
             if !left {
                 forgetting.forgotten.removed.push(id);
-                gone.push(index);
-            } else if pixels > 0 && !forgetting.forgotten.changed.contains(&id) {
-                forgetting.forgotten.changed.push(id);
+                gone.push(id);
+            } else if pixels > 0 {
+                self.touch(index);
+                if !forgetting.forgotten.changed.contains(&id) {
+                    forgetting.forgotten.changed.push(id);
+                }
             }
-            forgetting.gone_through.insert(id, version);
+            forgetting.gone_through.insert(id, written);
         }
-        self.remove(&gone);
-        is_last
+        gone.sort_unstable();
+        self.remove(|head| gone.binary_search(&head.id).is_ok());
+        is_last && self.absent_to_forget(forgetting, 1).is_empty()
     }
 
-    /// Removes the viewpoints at these indices, which rise; the others keep their order.
-    fn remove(&mut self, indices: &[usize]) {
-        for &index in indices {
-            self.bytes -= self.viewpoints[index].bytes();
-        }
-        let mut index = 0;
-        self.viewpoints.retain(|_| {
-            index += 1;
-            indices.binary_search(&(index - 1)).is_err()
-        });
+    /// Ids of viewpoints that are not in RAM and have yet to be gone through, rising, at most so many.
+    pub fn absent_to_forget(&self, forgetting: &Forgetting, count: usize) -> Vec<u64> {
+        let absent = self.absent_heads();
+        let pending = absent.filter(|head| forgetting.is_head_pending(head));
+        pending.map(|head| head.id).take(count).collect()
     }
 }
 
 /// Clears the pixels whose points lie in the region, all of them without one, and returns how many had depth. What goes
 /// whole is only counted.
-fn clear(viewpoint: &mut Viewpoint, region: Option<Region>) -> u64 {
+fn clear(viewpoint: &mut Arc<Viewpoint>, region: Option<Region>) -> u64 {
     let Some(region) = region else {
         return viewpoint.mesh.depth_m.iter().filter(|&&z| z > 0.0).count() as u64;
     };
@@ -175,7 +187,8 @@ fn clear(viewpoint: &mut Viewpoint, region: Option<Region>) -> u64 {
     }
     let pixels = gone.iter().filter(|gone| **gone).count() as u64;
     if pixels > 0 {
-        viewpoint.clear(&gone);
+        // Who stores it meanwhile keeps what it was.
+        Arc::make_mut(viewpoint).clear(&gone);
     }
     pixels
 }

@@ -1,9 +1,21 @@
 //! What a place remembers: its viewpoints, how they grow, which one a new posterior replaces, and what is forgotten.
+//!
+//! Viewpoints may be stored durably; then the memory is what is in RAM of them, and an index of the others.
 
 pub mod forget;
 
+pub mod residency;
+
+pub mod store;
+
 pub mod visit;
 
+use std::{
+    collections::{BTreeMap, BTreeSet},
+    sync::Arc,
+};
+
+use self::residency::{Absent, Change, Mark};
 use crate::{
     config::{Replacement, Settings},
     model::{
@@ -12,13 +24,30 @@ use crate::{
     },
 };
 
-/// The viewpoints of one place, in the order they were made.
+/// The viewpoints of one place.
 #[derive(Debug, Default)]
 pub struct Memory {
-    viewpoints: Vec<Viewpoint>,
+    /// Those in RAM.
+    viewpoints: Vec<Arc<Viewpoint>>,
+    /// One for each of them.
+    marks: Vec<Mark>,
+    /// Those that are only stored, by id.
+    absent: BTreeMap<u64, Absent>,
+    /// Ids of what changed since somebody took the changes; `None` where nobody stores them.
+    changed: Option<BTreeSet<u64>>,
+    /// Counts frames and questions: what they need is used most recently.
+    turn: u64,
     bytes: usize,
     last_id: u64,
     replaced_for_room: u64,
+    evicted: u64,
+}
+
+/// Which state of a viewpoint is stored: under which lease it was written, and its revision. Later ones are greater.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+pub struct Version {
+    pub epoch: u64,
+    pub revision: u64,
 }
 
 /// Where a posterior goes.
@@ -32,10 +61,12 @@ pub enum Slot {
 }
 
 impl Memory {
-    pub fn viewpoints(&self) -> &[Viewpoint] {
+    /// Those in RAM; in the order they were made where all are.
+    pub fn viewpoints(&self) -> &[Arc<Viewpoint>] {
         &self.viewpoints
     }
 
+    /// Of the viewpoints in RAM.
     pub fn bytes(&self) -> usize {
         self.bytes
     }
@@ -76,7 +107,8 @@ impl Memory {
         if !append {
             return Slot::Overwrite(overwritten);
         }
-        if self.bytes + bytes > settings.memory_bytes {
+        let excess = (self.bytes + bytes).saturating_sub(settings.memory_bytes);
+        if excess > self.evictable_bytes(excess) {
             return Slot::Reuse(nearest);
         }
         Slot::Append
@@ -85,35 +117,75 @@ impl Memory {
     /// Puts a viewpoint where [`Self::slot`] said and returns its id. A new viewpoint gets a new id; an updated one keeps
     /// its id and its home, and counts the update.
     pub fn write(&mut self, slot: Slot, viewpoint: Viewpoint) -> u64 {
-        self.replace(slot, viewpoint).0
+        self.replace(slot, Arc::new(viewpoint)).0
     }
 
-    /// As [`Self::write`], and gives back what was there before.
-    pub fn replace(&mut self, slot: Slot, mut viewpoint: Viewpoint) -> (u64, Option<Viewpoint>) {
+    /// As [`Self::write`], of a viewpoint that nobody else has, and gives back what was there before.
+    pub fn replace(
+        &mut self,
+        slot: Slot,
+        mut viewpoint: Arc<Viewpoint>,
+    ) -> (u64, Option<Arc<Viewpoint>>) {
+        let written = Arc::get_mut(&mut viewpoint).expect("a new viewpoint has one owner");
         if let Slot::Overwrite(index) = slot {
             let old = &self.viewpoints[index];
-            viewpoint.id = old.id;
-            viewpoint.world_from_home = old.world_from_home;
-            viewpoint.updates = old.updates + 1;
+            written.id = old.id;
+            written.world_from_home = old.world_from_home;
+            written.updates = old.updates + 1;
         } else {
             self.last_id += 1;
-            viewpoint.id = self.last_id;
-            viewpoint.updates = 1;
+            written.id = self.last_id;
+            written.updates = 1;
         }
         let id = viewpoint.id;
         self.bytes += viewpoint.bytes();
+        let new = Mark::new(self.turn);
         let old = match slot {
             Slot::Append => {
                 self.viewpoints.push(viewpoint);
+                self.marks.push(new);
                 None
             }
             Slot::Overwrite(index) | Slot::Reuse(index) => {
                 let old = std::mem::replace(&mut self.viewpoints[index], viewpoint);
                 self.bytes -= old.bytes();
-                self.replaced_for_room += u64::from(matches!(slot, Slot::Reuse(_)));
+                if let Slot::Reuse(_) = slot {
+                    self.replaced_for_room += 1;
+                    self.marks[index] = new;
+                    self.note(old.id);
+                } else {
+                    self.marks[index].change(self.turn);
+                }
                 Some(old)
             }
         };
+        self.note(id);
         (id, old)
+    }
+
+    /// Notes that a viewpoint changed or went.
+    fn note(&mut self, id: u64) {
+        if let Some(changed) = &mut self.changed {
+            changed.insert(id);
+        }
+    }
+
+    /// What changed since this was asked last; the first time, everything changes from now on are kept for.
+    pub fn take_changes(&mut self) -> Vec<Change> {
+        let changed = self.changed.replace(BTreeSet::new()).unwrap_or_default();
+        changed
+            .into_iter()
+            .map(|id| match self.index_of(id) {
+                Some(index) => Change::Written {
+                    viewpoint: self.viewpoints[index].clone(),
+                    revision: self.marks[index].revision,
+                },
+                None => Change::Removed(id),
+            })
+            .collect()
+    }
+
+    fn index_of(&self, id: u64) -> Option<usize> {
+        self.viewpoints.iter().position(|held| held.id == id)
     }
 }

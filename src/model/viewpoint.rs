@@ -47,6 +47,8 @@ pub struct Mesh {
     pub intrinsics: Intrinsics,
     /// Metres along the optical axis; 0 = none. `width * height`.
     pub depth_m: Vec<f32>,
+    /// Where it was cut.
+    pub joined: MeshCut,
     /// Triangles of the quad whose upper left vertex is this pixel; rows of `width - 1`.
     pub cut: Vec<u8>,
     /// Least and greatest depth of the vertices of sixteen quads of a row, rows of [`Self::blocks`]; `inf` and 0 without
@@ -73,6 +75,7 @@ impl Mesh {
     pub fn join(&mut self, cut: MeshCut) {
         let Intrinsics { width, height, .. } = self.intrinsics;
         assert_eq!(self.depth_m.len(), width * height, "one depth a pixel");
+        self.joined = cut;
         self.find_ranges();
         self.cut.clear();
         self.cut
@@ -259,6 +262,18 @@ fn coarse_luminance_row(
     }
 }
 
+/// What is known about a viewpoint without its planes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Head {
+    pub id: u64,
+    pub world_from_camera: Pose,
+    pub world_from_home: Pose,
+    pub intrinsics: Intrinsics,
+    pub source: Source,
+    pub stamp_ns: i64,
+    pub updates: u64,
+}
+
 #[derive(Debug, Clone, PartialEq)]
 pub struct Viewpoint {
     pub id: u64,
@@ -277,6 +292,50 @@ pub struct Viewpoint {
 }
 
 impl Viewpoint {
+    /// From what is stored of it; the rest follows.
+    pub fn from_stored(
+        head: Head,
+        depth_m: Vec<f32>,
+        joined: MeshCut,
+        records: Vec<Record>,
+    ) -> Self {
+        let unknown = Record::pack(&Belief::unknown());
+        let forgotten: Vec<bool> = records
+            .iter()
+            .zip(&depth_m)
+            .map(|(record, &z)| *record == unknown && z <= 0.0)
+            .collect();
+        let mesh = Mesh::new(head.intrinsics, depth_m, joined);
+        let mut viewpoint = Self {
+            id: head.id,
+            world_from_camera: head.world_from_camera,
+            world_from_home: head.world_from_home,
+            coarse: Coarse::new(&mesh, &records, joined),
+            mesh,
+            records,
+            source: head.source,
+            stamp_ns: head.stamp_ns,
+            updates: head.updates,
+        };
+        // The coarse picture has forgotten more than its planes tell.
+        if forgotten.contains(&true) {
+            viewpoint.clear(&forgotten);
+        }
+        viewpoint
+    }
+
+    pub fn head(&self) -> Head {
+        Head {
+            id: self.id,
+            world_from_camera: self.world_from_camera,
+            world_from_home: self.world_from_home,
+            intrinsics: self.mesh.intrinsics,
+            source: self.source.clone(),
+            stamp_ns: self.stamp_ns,
+            updates: self.updates,
+        }
+    }
+
     /// Forgets the pixels for which `gone` says so, one flag a pixel: they lie on no surface any more, and nothing is
     /// left of what they looked like. Everything else stays bit for bit.
     pub fn clear(&mut self, gone: &[bool]) {

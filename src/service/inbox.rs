@@ -109,6 +109,8 @@ struct State {
     counters: InboxCounters,
     /// A camera came or went.
     live_changed: bool,
+    /// The stored memory has news.
+    memory_news: bool,
     closed: bool,
 }
 
@@ -128,6 +130,8 @@ pub struct Delivery {
     pub frames: Vec<Source>,
     /// A camera came or went.
     pub live_changed: bool,
+    /// The stored memory has news.
+    pub memory_news: bool,
     pub closed: bool,
 }
 
@@ -229,6 +233,12 @@ impl Inbox {
         drop(state);
         self.wake.notify_one();
         Ok(())
+    }
+
+    /// Says that the stored memory has news.
+    pub fn put_memory_news(&self) {
+        self.lock().memory_news = true;
+        self.wake.notify_one();
     }
 
     /// The ask that waited longest since it came or was last worked at. It keeps its room until [`Self::end_ask`].
@@ -366,6 +376,7 @@ impl State {
         let mut delivery = Delivery {
             asks: !self.asks.is_empty(),
             live_changed: std::mem::take(&mut self.live_changed),
+            memory_news: std::mem::take(&mut self.memory_news),
             closed: self.closed,
             ..Delivery::default()
         };
@@ -395,6 +406,7 @@ impl Delivery {
             && !self.asks
             && self.frames.is_empty()
             && !self.live_changed
+            && !self.memory_news
             && !self.closed
     }
 }

@@ -58,6 +58,7 @@ use crate::{
     config::{ConfigError, Settings},
     engine::{Engine, EngineError, EngineKind},
     isa::Isa,
+    memory::store::{RETRY_MAX, Store},
     wire::{decode::Limits, keys},
 };
 
@@ -68,6 +69,8 @@ const STOP_WITHIN: Duration = Duration::from_secs(5);
 #[derive(Debug, Clone)]
 pub struct Options {
     pub settings: Settings,
+    /// Where memories last; `None`: they end with the service.
+    pub store: Option<Store>,
     pub engine: EngineKind,
     pub root: String,
     /// `None`: no HTTP.
@@ -116,6 +119,27 @@ pub async fn serve(options: Options, stop: impl Future<Output = ()>) -> Result<(
     Service::start(options).await?.run(stop).await
 }
 
+/// Opens the places that are stored, as soon as the store can be reached: they can be asked before a frame comes.
+async fn open_stored(places: Arc<Places>) {
+    let Some(store) = &places.store else {
+        return;
+    };
+    let names = loop {
+        match store.places().await {
+            Ok(names) => break names,
+            Err(error) => {
+                tracing::warn!("stored places are not known yet: {error}");
+                tokio::time::sleep(RETRY_MAX).await;
+            }
+        }
+    };
+    for name in names.into_iter().filter(|name| keys::is_id(name)) {
+        if let Err(refusal) = places.get_or_open(&name.as_str().into()) {
+            tracing::warn!("place {name} is stored but not opened: {refusal}");
+        }
+    }
+}
+
 impl Service {
     /// Opens everything. Needs a multi-threaded tokio runtime.
     ///
@@ -124,6 +148,7 @@ impl Service {
     pub async fn start(options: Options) -> Result<Self, ServeError> {
         let Options {
             settings,
+            store,
             engine,
             root,
             http,
@@ -172,6 +197,7 @@ impl Service {
         let (news, told) = mpsc::channel(NEWS_MAX);
         let (places, starts) = Places::new(
             settings,
+            store,
             engine,
             root.into(),
             session,
@@ -180,6 +206,7 @@ impl Service {
             http.is_some().then_some(news),
         );
         let places = Arc::new(places);
+        tokio::spawn(open_stored(places.clone()));
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
         let questions = Arc::new(Questions::new(places.clone(), ingest.counters.clone()));
         let mut queryables: Vec<_> = queries::start(&questions, &ingest.counters)

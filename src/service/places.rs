@@ -8,7 +8,10 @@ use std::{
 };
 
 use rayon::ThreadPool;
-use tokio::sync::{mpsc, watch};
+use tokio::{
+    runtime::Handle,
+    sync::{mpsc, watch},
+};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use super::{
@@ -24,6 +27,7 @@ use crate::{
     config::Settings,
     engine::{Engine, EngineKind},
     isa::Isa,
+    memory::store::{PlaceOptions, PlaceStore, Store},
     model::refusal::Refusal,
     pipeline::Pipeline,
     wire::keys,
@@ -51,6 +55,9 @@ struct Publish {
 
 pub struct Places {
     pub settings: Settings,
+    /// Where memories last; `None`: they end with the service.
+    pub store: Option<Store>,
+    runtime: Handle,
     engine: EngineKind,
     pub root: Arc<str>,
     pub session: Session,
@@ -73,8 +80,10 @@ struct Running {
 pub type Starts = mpsc::Receiver<Arc<str>>;
 
 impl Places {
+    /// On a tokio runtime.
     pub fn new(
         settings: Settings,
+        store: Option<Store>,
         engine: EngineKind,
         root: Arc<str>,
         session: Session,
@@ -85,6 +94,8 @@ impl Places {
         let (starts, started) = mpsc::channel(PLACES_MAX);
         let places = Self {
             settings,
+            store,
+            runtime: Handle::current(),
             engine,
             root,
             session,
@@ -187,7 +198,15 @@ impl Places {
         let isa = Isa::detect();
         let engine = Engine::new(self.engine, &self.settings, self.pool.clone(), isa)?;
         let pipeline = Pipeline::with_engine(self.settings.clone(), self.pool.clone(), isa, engine);
+        let memory = self.store.as_ref().map(|store| {
+            let inbox = place.inbox.clone();
+            let options = PlaceOptions::new(&self.settings);
+            PlaceStore::open(store, name, options, &self.runtime, move || {
+                inbox.put_memory_news();
+            })
+        });
         let worker = Worker {
+            memory,
             place: name.clone(),
             root: self.root.clone(),
             session: self.session.clone(),

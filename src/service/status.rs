@@ -8,6 +8,7 @@ use utoipa::ToSchema;
 use super::inbox::{InboxCounters, SlotCounters};
 use crate::{
     engine::gpu::Counters,
+    memory::store::StoreStatus,
     model::{camera::Intrinsics, mode::Mode},
     wire::proto,
 };
@@ -34,11 +35,19 @@ pub struct PlaceTotals {
     pub frames_lost: u64,
     #[serde(flatten)]
     pub inbox: InboxCounters,
+    /// In RAM.
     pub viewpoints: usize,
     pub memory_bytes: usize,
     pub memory_bytes_max: usize,
     /// Viewpoints forgotten because the memory was full.
     pub replaced_for_room: u64,
+    /// Viewpoints that are known, in RAM or only stored.
+    pub viewpoints_known: usize,
+    /// Viewpoints that left RAM because others were needed there.
+    pub evicted: u64,
+    /// `None`: the memory ends with the service.
+    #[schema(value_type = Option<Object>)]
+    pub store: Option<StoreStatus>,
     /// What cameras begin with.
     #[schema(value_type = String)]
     pub mode: Mode,

@@ -21,6 +21,7 @@ use super::{
     turns::{self, Hands, take_turns},
 };
 use crate::{
+    memory::{forget::Forgetting, store::PlaceStore},
     model::{
         camera::Intrinsics,
         frame::{RgbImage, Source},
@@ -47,8 +48,15 @@ const MODES_MAX: usize = 1024;
 /// Viewpoints that a step of forgetting goes through: about the time of a frame, and more than all cameras can write
 /// between two steps, so that it comes to an end.
 const FORGET_STEP: usize = 2 * CAMERAS_MAX;
+/// Stored viewpoints that such a step brings into RAM.
+const FORGET_LOADED: usize = 16;
 /// A ring's camera is imagined no larger than this where nothing is said: ranks hardly depend on it.
 const IMAGINED_PIXELS_MAX: usize = 320 * 240;
+
+/// How long a starting worker waits for what is stored of its place.
+const READ_WITHIN: Duration = Duration::from_secs(3);
+/// How long a closing worker waits until everything is stored.
+const STORE_WITHIN: Duration = Duration::from_secs(2);
 
 pub struct Worker {
     pub place: Arc<str>,
@@ -56,6 +64,8 @@ pub struct Worker {
     pub session: zenoh::Session,
     pub inbox: Arc<Inbox>,
     pub pipeline: Pipeline,
+    /// Where the place's memory lasts.
+    pub memory: Option<PlaceStore>,
     pub status: watch::Sender<Arc<PlaceStatus>>,
     pub events: watch::Sender<Arc<PlaceEvents>>,
     pub metrics: Arc<Metrics>,
@@ -115,8 +125,19 @@ impl Worker {
             asks: AskCounters::default(),
             worker: self,
         };
+        if let Some(memory) = &desk.worker.memory {
+            // Most stores answer at once; frames of the others are refused with the reason.
+            memory.wait_read(READ_WITHIN);
+        }
+        desk.sync_memory();
         let inbox = desk.worker.inbox.clone();
         take_turns(&inbox, &mut desk);
+        let Worker {
+            memory, pipeline, ..
+        } = &mut desk.worker;
+        if let Some(memory) = memory {
+            memory.close(pipeline.memory_mut(), STORE_WITHIN);
+        }
     }
 }
 
@@ -133,6 +154,7 @@ impl Hands for Desk {
         for source in delivery.frames {
             self.receive_frame(&source);
         }
+        self.sync_memory();
         self.fit_markers();
     }
 
@@ -345,11 +367,27 @@ impl Desk {
         let lenses = camera.lenses(packed.calibration.as_ref(), limits)?;
         let frame = unpack(packed, &lenses, source.clone(), pose, noise, limits)?;
         stopwatch.decoded();
-        let pipeline = &mut self.worker.pipeline;
+        let Worker {
+            place,
+            pipeline,
+            memory,
+            ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            if mode == Mode::Learn {
+                memory.may_learn()?;
+            }
+            memory.bring(pipeline.memory_mut(), &pose);
+        }
         let report = pipeline.process_staged(mode, &frame, &mut |stage| stopwatch.ended(stage))?;
+        if let Some(memory) = memory {
+            let held = pipeline.memory_mut();
+            memory.sync(held);
+            memory.prefetch(held, source, (frame.stamp_ns, report.world_from_camera));
+        }
         let processing_seconds = stopwatch.elapsed().as_secs_f64();
         self.maps_of = Some(source.clone());
-        let message = encode::report(&report, &self.worker.place, processing_seconds);
+        let message = encode::report(&report, place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
         stopwatch.published(arrived);
@@ -400,6 +438,26 @@ impl Desk {
         });
     }
 
+    /// Learns what is new about the stored memory.
+    fn sync_memory(&mut self) {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.sync(pipeline.memory_mut());
+        }
+    }
+
+    /// Has in RAM what is stored around a pose.
+    fn bring(&mut self, world_from_camera: &Pose) {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.bring(pipeline.memory_mut(), world_from_camera);
+        }
+    }
+
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
         let root = self.worker.root.clone();
         *self.refused_by.entry(refused.refusal.code).or_default() += 1;
@@ -435,6 +493,7 @@ impl Desk {
                 answer,
             } => {
                 self.asks.passes += 1;
+                self.bring(&world_from_camera);
                 let prior = self.worker.pipeline.prior(&intrinsics, &world_from_camera);
                 drop(answer.send(Ok(PriorPlanes::new(&prior, &planes))));
             }
@@ -451,11 +510,10 @@ impl Desk {
                 limit,
                 answer,
             } => {
-                let views = self.worker.pipeline.memory().viewpoints();
-                let mut asked: Vec<_> = views.iter().filter(|view| view.id > after).collect();
-                asked.sort_unstable_by_key(|view| view.id);
-                asked.truncate(limit);
-                drop(answer.send(Ok(encode::views_reply(asked.into_iter(), views.len()))));
+                let memory = self.worker.pipeline.memory();
+                let views = memory.heads();
+                let asked = views.iter().filter(|view| view.id > after).take(limit);
+                drop(answer.send(Ok(encode::views_reply(asked, memory.known()))));
             }
             Ask::Snapshot { camera, answer } => {
                 let current = self.maps_of.as_ref() == Some(&camera);
@@ -492,6 +550,7 @@ impl Desk {
             } => {
                 if let Some(candidate) = candidates.get(promises.len()) {
                     self.asks.passes += 1;
+                    self.bring(candidate);
                     promises.push(self.worker.pipeline.promise(&intrinsics, candidate));
                 }
                 if promises.len() < candidates.len() {
@@ -509,10 +568,15 @@ impl Desk {
                 answer,
             } => {
                 self.asks.passes += 1;
-                if !self.worker.pipeline.forget(&mut forgetting, FORGET_STEP) {
-                    return Some(Ask::Forget { forgetting, answer });
+                match self.forget_step(&mut forgetting) {
+                    Ok(true) => {}
+                    Ok(false) => return Some(Ask::Forget { forgetting, answer }),
+                    Err(refusal) => {
+                        drop(answer.send(Err(refusal)));
+                        return None;
+                    }
                 }
-                let left = self.worker.pipeline.memory().viewpoints().len();
+                let left = self.worker.pipeline.memory().known();
                 let reply = encode::forget_reply(forgetting.forgotten(), left);
                 tracing::info!(
                     place = &*self.worker.place,
@@ -536,6 +600,25 @@ impl Desk {
             }
         }
         None
+    }
+
+    /// Whether all is forgotten now. What is only stored is gone through as well.
+    ///
+    /// # Errors
+    /// Another service writes the place.
+    fn forget_step(&mut self, forgetting: &mut Forgetting) -> Result<bool, Refusal> {
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.may_learn()?;
+            let held = pipeline.memory_mut();
+            let stored = held.absent_to_forget(forgetting, FORGET_LOADED);
+            memory.fetch(held, stored);
+        }
+        let done = pipeline.forget(forgetting, FORGET_STEP);
+        self.sync_memory();
+        Ok(done)
     }
 
     /// The poses to compare, and the camera they are imagined for.
@@ -599,6 +682,7 @@ impl Desk {
         )?;
         // The maps are of the evaluated frame from here on.
         self.maps_of = None;
+        self.bring(&frame.world_from_camera);
         let report = self.worker.pipeline.evaluate(&frame)?;
         Ok(Evaluated {
             report,
@@ -644,6 +728,9 @@ impl Desk {
             frames_lost: self.frames_lost_before + lost,
             inbox: self.worker.inbox.counters(),
             viewpoints: memory.viewpoints().len(),
+            viewpoints_known: memory.known(),
+            evicted: memory.evicted(),
+            store: self.worker.memory.as_ref().map(PlaceStore::status),
             memory_bytes: memory.bytes(),
             memory_bytes_max: pipeline.settings().memory_bytes,
             replaced_for_room: memory.replaced_for_room(),

@@ -18,7 +18,7 @@ use crate::{
         pose::Pose,
         refusal::Refusal,
         report::{PixelBox, Region, Report},
-        viewpoint::Viewpoint,
+        viewpoint::Head,
     },
     pipeline::{Maps, PriorAt},
     stages::{
@@ -479,7 +479,7 @@ fn covered(prior: &Prior) -> f32 {
     seen.count() as f32 / (prior.width * prior.height).max(1) as f32
 }
 
-pub fn view(viewpoint: &Viewpoint) -> proto::View {
+pub fn view(viewpoint: &Head) -> proto::View {
     proto::View {
         id: viewpoint.id,
         world_from_camera: Some(pose(&viewpoint.world_from_camera)),
@@ -491,10 +491,7 @@ pub fn view(viewpoint: &Viewpoint) -> proto::View {
 }
 
 /// `views` as they are to be listed; `total` are in the memory.
-pub fn views_reply<'a>(
-    views: impl Iterator<Item = &'a Viewpoint>,
-    total: usize,
-) -> proto::ViewsReply {
+pub fn views_reply<'a>(views: impl Iterator<Item = &'a Head>, total: usize) -> proto::ViewsReply {
     proto::ViewsReply {
         views: views.map(view).collect(),
         total: total as u64,

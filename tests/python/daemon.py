@@ -57,9 +57,11 @@ class Daemon:
     def __init__(self, *arguments: str):
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.http = f"http://127.0.0.1:{free_port()}"
+        # What tests learn is nothing that lasts, unless they say where.
+        memory = [] if "--memory" in arguments else ["--memory", "memory://"]
         self._log = tempfile.TemporaryFile("w+")
         self.process = subprocess.Popen(
-            [BINARY, "serve", "-l", self.endpoint, "--http", self.http.removeprefix("http://"), *arguments],
+            [BINARY, "serve", *memory, "-l", self.endpoint, "--http", self.http.removeprefix("http://"), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=subprocess.STDOUT,

@@ -51,6 +51,7 @@ impl Rig {
         let settings: Vec<String> = settings.iter().map(|&pair| pair.to_owned()).collect();
         let alone = ["scouting/gossip/enabled:false".to_owned()];
         let service = Service::start(Options {
+            store: None,
             engine: EngineKind::Cpu,
             settings: Settings::layered(Preset::Robust, None, &settings).expect("good settings"),
             root: "test/surprised".to_owned(),

@@ -298,7 +298,13 @@ async fn healthz() -> &'static str {
             content_type = "application/problem+json"),
     ))]
 async fn readyz(State(app): State<App>) -> Response {
-    let missing = app.readiness.missing();
+    let mut missing = app.readiness.missing();
+    for (name, place) in app.parts.places.all() {
+        let store = place.status.borrow().totals.store.clone();
+        if let Some(trouble) = store.and_then(|store| store.trouble) {
+            missing.push(format!("the stored memory of {name} ({trouble})"));
+        }
+    }
     if missing.is_empty() {
         "ready\n".into_response()
     } else {

@@ -1,0 +1,271 @@
+//! Where the objects of a place lie, below the store's URL:
+//!
+//! ```text
+//! PLACE/viewpoints/ID-EPOCH-REVISION    one object a viewpoint (see `form`); numbers in hexadecimal
+//! PLACE/lease/EPOCH                     who writes the place (see `lease`)
+//! PLACE/damaged/...                     what could not be read, under the name it had
+//! PLACE/lock                            on disk only: locked by the process that writes the place
+//! ```
+//!
+//! An object is written once, under a name that no other state has, by a put that fails where there is one already; the
+//! state before is deleted after. So nothing is ever overwritten: a crash leaves the old state, both or the new one,
+//! and a writer that has lost the place cannot harm what its successor, whose epoch is greater, has written.
+//!
+//! On disk an object is written aside, synced, linked to its name, and the folder synced: `object_store` does that when
+//! asked to. It does not sync folders after deleting, which matters where something was forgotten; that is done here.
+
+use std::{path::PathBuf, sync::Arc};
+
+use bytes::Bytes;
+use futures_util::TryStreamExt;
+use object_store::{
+    Error, GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions, path::Path,
+};
+
+use super::form::HEAD_BYTES_MAX;
+use crate::memory::Version;
+
+pub const VIEWPOINTS: &str = "viewpoints";
+const LEASE: &str = "lease";
+const DAMAGED: &str = "damaged";
+const LOCK: &str = "lock";
+
+pub type Result<T> = std::result::Result<T, Error>;
+
+/// What a store's listing says of one stored viewpoint.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Listed {
+    pub id: u64,
+    pub version: Version,
+    pub bytes: u64,
+}
+
+/// Everything below `viewpoints`.
+#[derive(Debug, Default)]
+pub struct Listing {
+    pub viewpoints: Vec<Listed>,
+    /// Names that no viewpoint has.
+    pub strangers: Vec<Path>,
+}
+
+#[derive(Debug, Clone)]
+pub struct Shelf {
+    objects: Arc<dyn ObjectStore>,
+    at: Path,
+    /// The same on this machine's disk.
+    folder: Option<PathBuf>,
+}
+
+impl Shelf {
+    pub fn new(objects: Arc<dyn ObjectStore>, at: Path, folder: Option<PathBuf>) -> Self {
+        Self {
+            objects,
+            at,
+            folder,
+        }
+    }
+
+    pub fn viewpoint(&self, id: u64, version: Version) -> Path {
+        let Version { epoch, revision } = version;
+        self.at
+            .clone()
+            .join(VIEWPOINTS)
+            .join(format!("{id:016x}-{epoch:08x}-{revision:016x}"))
+    }
+
+    fn lease(&self, epoch: u64) -> Path {
+        self.at.clone().join(LEASE).join(format!("{epoch:016x}"))
+    }
+
+    /// The file that the writing process locks.
+    pub fn lock_file(&self) -> Option<PathBuf> {
+        self.folder.as_ref().map(|folder| folder.join(LOCK))
+    }
+
+    pub async fn list(&self) -> Result<Listing> {
+        let mut listing = Listing::default();
+        let mut objects = self.objects.list(Some(&self.at.clone().join(VIEWPOINTS)));
+        while let Some(object) = objects.try_next().await? {
+            match object.location.filename().and_then(parse) {
+                Some((id, version)) => listing.viewpoints.push(Listed {
+                    id,
+                    version,
+                    bytes: object.size,
+                }),
+                None => listing.strangers.push(object.location),
+            }
+        }
+        Ok(listing)
+    }
+
+    /// Enough of the object's beginning for its head.
+    pub async fn get_head(&self, id: u64, version: Version) -> Result<Bytes> {
+        let options = GetOptions {
+            range: Some(GetRange::Bounded(0..HEAD_BYTES_MAX as u64)),
+            ..GetOptions::default()
+        };
+        let path = self.viewpoint(id, version);
+        self.objects.get_opts(&path, options).await?.bytes().await
+    }
+
+    /// The whole object; `None` if it is larger than `bytes_max`, which is not read.
+    pub async fn get(&self, id: u64, version: Version, bytes_max: u64) -> Result<Option<Bytes>> {
+        let object = self.objects.get(&self.viewpoint(id, version)).await?;
+        if object.meta.size > bytes_max {
+            return Ok(None);
+        }
+        object.bytes().await.map(Some)
+    }
+
+    /// Writes an object once; nothing happens where it is already.
+    pub async fn put(&self, id: u64, version: Version, object: Bytes) -> Result<()> {
+        let path = self.viewpoint(id, version);
+        match self.create(&path, object).await {
+            // Only the holder of the epoch makes this name: an answer was lost on the way.
+            Err(Error::AlreadyExists { .. }) => Ok(()),
+            result => result,
+        }
+    }
+
+    async fn create(&self, path: &Path, object: Bytes) -> Result<()> {
+        let options = PutOptions::from(PutMode::Create);
+        self.objects.put_opts(path, object.into(), options).await?;
+        Ok(())
+    }
+
+    /// Deletes states of viewpoints; those that are not there are none. Deleted for good where `synced`.
+    pub async fn delete(&self, states: &[(u64, Version)], synced: bool) -> Result<()> {
+        for &(id, version) in states {
+            match self.objects.delete(&self.viewpoint(id, version)).await {
+                Ok(()) | Err(Error::NotFound { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        if synced && let Some(folder) = &self.folder {
+            let folder = folder.join(VIEWPOINTS);
+            on_disk(move || std::fs::File::open(folder)?.sync_all()).await?;
+        }
+        Ok(())
+    }
+
+    /// Moves an object to where nobody reads it; its new path.
+    pub async fn set_aside(&self, id: u64, version: Version) -> Result<Path> {
+        self.move_aside(&self.viewpoint(id, version)).await
+    }
+
+    pub async fn move_aside(&self, path: &Path) -> Result<Path> {
+        let name = path.filename().unwrap_or("nameless");
+        let aside = self.at.clone().join(DAMAGED).join(name);
+        self.objects.rename(path, &aside).await?;
+        Ok(aside)
+    }
+
+    /// Paths of what was set aside, at most so many, and how many there are.
+    pub async fn damaged(&self, names_max: usize) -> Result<(Vec<String>, u64)> {
+        let (mut names, mut count) = (Vec::new(), 0);
+        let mut objects = self.objects.list(Some(&self.at.clone().join(DAMAGED)));
+        while let Some(object) = objects.try_next().await? {
+            count += 1;
+            if names.len() < names_max {
+                names.push(object.location.to_string());
+            }
+        }
+        Ok((names, count))
+    }
+
+    /// The greatest epoch of which there is a lease, and what it says.
+    pub async fn latest_lease(&self) -> Result<Option<(u64, Bytes)>> {
+        let mut epochs = self.lease_epochs().await?;
+        epochs.sort_unstable();
+        while let Some(epoch) = epochs.pop() {
+            match self.objects.get(&self.lease(epoch)).await {
+                Ok(object) => return Ok(Some((epoch, object.bytes().await?))),
+                // A newer one came meanwhile, and this one was deleted.
+                Err(Error::NotFound { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(None)
+    }
+
+    pub async fn lease_epochs(&self) -> Result<Vec<u64>> {
+        let objects = self.objects.list(Some(&self.at.clone().join(LEASE)));
+        let epochs = objects.try_filter_map(async |object| {
+            let name = object.location.filename().unwrap_or("");
+            Ok(u64::from_str_radix(name, 16).ok())
+        });
+        epochs.try_collect().await
+    }
+
+    /// Makes the lease of an epoch; false where there is one.
+    pub async fn create_lease(&self, epoch: u64, content: Bytes) -> Result<bool> {
+        match self.create(&self.lease(epoch), content).await {
+            Ok(()) => Ok(true),
+            Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => Ok(false),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Writes one's own lease anew.
+    pub async fn renew_lease(&self, epoch: u64, content: Bytes) -> Result<()> {
+        self.objects.put(&self.lease(epoch), content.into()).await?;
+        Ok(())
+    }
+
+    /// Deletes the leases before an epoch.
+    pub async fn delete_leases_before(&self, epoch: u64) -> Result<()> {
+        for earlier in self.lease_epochs().await? {
+            if earlier < epoch {
+                match self.objects.delete(&self.lease(earlier)).await {
+                    Ok(()) | Err(Error::NotFound { .. }) => {}
+                    Err(error) => return Err(error),
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Deletes what a crash left half written on disk: `object_store` writes aside to names with `#`, and never lists
+    /// them. Only for who writes the place.
+    pub async fn sweep(&self) -> Result<()> {
+        let Some(folder) = &self.folder else {
+            return Ok(());
+        };
+        let folder = folder.join(VIEWPOINTS);
+        on_disk(move || {
+            let entries = match std::fs::read_dir(&folder) {
+                Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+                entries => entries?,
+            };
+            for entry in entries {
+                let entry = entry?;
+                if entry.file_name().to_string_lossy().contains('#') {
+                    std::fs::remove_file(entry.path())?;
+                }
+            }
+            Ok(())
+        })
+        .await
+    }
+}
+
+async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<()> {
+    let done = tokio::task::spawn_blocking(work).await;
+    done.map_err(|source| Error::JoinError { source })?
+        .map_err(|error| Error::Generic {
+            store: "LocalFileSystem",
+            source: error.into(),
+        })
+}
+
+fn parse(name: &str) -> Option<(u64, Version)> {
+    let hex = |text: &str| u64::from_str_radix(text, 16).ok();
+    let mut parts = name.split('-');
+    let id = hex(parts.next()?)?;
+    let epoch = hex(parts.next()?)?;
+    let revision = hex(parts.next()?)?;
+    parts
+        .next()
+        .is_none()
+        .then_some((id, Version { epoch, revision }))
+}

