@@ -5,17 +5,16 @@
 //! the other pose with its colours. Pictures are compared as they came, without refinement of the pose or gain, in grey
 //! levels.
 
-use std::sync::Arc;
-
-use rayon::ThreadPool;
 use serde::Serialize;
 
 use crate::{
     config::Settings,
     dataset::Recording,
-    engine::cpu::{CpuEngine, RecallView},
+    engine::{
+        Engines,
+        cpu::{CpuEngine, RecallView},
+    },
     evaluation::measure::MeasureError,
-    isa::Isa,
     model::{
         belief::{Belief, CHANNELS, Record, rgb_from_ycbcr, ycbcr_from_rgb},
         frame::{Frame, Source},
@@ -69,7 +68,7 @@ type Predicted = Vec<Option<[f32; CHANNELS]>>;
 pub fn evaluate(
     recording: &Recording,
     settings: &Settings,
-    pool: &Arc<ThreadPool>,
+    engines: &Engines,
 ) -> Result<HeldOut, MeasureError> {
     let moments = &recording.truth.moments;
     let begins = (0..recording.entries.len()).filter(|&index| {
@@ -95,14 +94,14 @@ pub fn evaluate(
         stamp_s: recording.entries[index].stamp_s,
         error,
     };
-    let mut pipeline = Pipeline::new(settings.clone(), pool.clone());
+    let mut pipeline = Pipeline::on(engines, settings.clone());
     for &index in &learnt {
         let frame = recording.frame(index, &source)?;
         pipeline
             .process(&frame)
             .map_err(|error| refused(index, error))?;
     }
-    let engine = CpuEngine::new(settings, pool.clone(), Isa::detect());
+    let engine = CpuEngine::new(settings, engines.pool().clone(), engines.isa());
     let mut sums = ["prior", "nearest warped", "nearest copied"].map(|name| Prediction {
         name,
         ..Prediction::default()

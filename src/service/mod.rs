@@ -47,7 +47,7 @@ use self::{
 };
 use crate::{
     config::{ConfigError, Settings},
-    engine::{Engine, EngineError, EngineKind},
+    engine::{EngineError, EngineKind, Engines},
     isa::Isa,
     wire::{decode::Limits, keys},
 };
@@ -146,16 +146,13 @@ impl Service {
             .build()
             .map_err(|error| ServeError::Threads(error.to_string()))?;
         let pool = Arc::new(pool);
-        if engine == EngineKind::Gpu {
-            // Each place opens its own device; that there is one is known before anything is promised.
-            Engine::new(engine, &settings, pool.clone(), Isa::detect())?;
-        }
+        let engines = Engines::new(engine, pool, Isa::detect())?;
         let session = zenoh::open(config).await.map_err(ServeError::Zenoh)?;
         let locators = session::locators(&session);
         drop(session_latch);
 
         let (failed, failures) = mpsc::unbounded_channel();
-        let (places, starts) = Places::new(settings, engine, root.into(), session, pool, failed);
+        let (places, starts) = Places::new(settings, engines, root.into(), session, failed);
         let places = Arc::new(places);
         let ingest = ingest::start(&places, starts).map_err(ServeError::Zenoh)?;
         let questions = Arc::new(Questions::new(places.clone(), ingest.counters.clone()));

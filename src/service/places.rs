@@ -7,18 +7,12 @@ use std::{
     thread::JoinHandle,
 };
 
-use rayon::ThreadPool;
 use tokio::sync::{mpsc, watch};
 use zenoh::{Session, Wait, liveliness::LivelinessToken};
 
 use super::{inbox::Inbox, ingest, status::PlaceStatus, worker::Worker};
 use crate::{
-    config::Settings,
-    engine::{Engine, EngineKind},
-    isa::Isa,
-    model::refusal::Refusal,
-    pipeline::Pipeline,
-    wire::keys,
+    config::Settings, engine::Engines, model::refusal::Refusal, pipeline::Pipeline, wire::keys,
 };
 
 /// Each is a thread and a memory of up to `memory_bytes`.
@@ -35,10 +29,9 @@ pub struct Place {
 
 pub struct Places {
     pub settings: Settings,
-    engine: EngineKind,
+    pub engines: Engines,
     pub root: Arc<str>,
     pub session: Session,
-    pool: Arc<ThreadPool>,
     places: RwLock<BTreeMap<Arc<str>, Arc<Place>>>,
     running: Mutex<Vec<Running>>,
     /// Told the name of each place whose worker has panicked or cannot start.
@@ -57,19 +50,17 @@ pub type Starts = mpsc::Receiver<Arc<str>>;
 impl Places {
     pub fn new(
         settings: Settings,
-        engine: EngineKind,
+        engines: Engines,
         root: Arc<str>,
         session: Session,
-        pool: Arc<ThreadPool>,
         failures: mpsc::UnboundedSender<String>,
     ) -> (Self, Starts) {
         let (starts, started) = mpsc::channel(PLACES_MAX);
         let places = Self {
             settings,
-            engine,
+            engines,
             root,
             session,
-            pool,
             places: RwLock::default(),
             running: Mutex::default(),
             failures,
@@ -155,9 +146,7 @@ impl Places {
         };
         let token = keys::live_service(&self.root, name, &self.session.zid().to_string());
         let token = self.session.liveliness().declare_token(token).wait()?;
-        let isa = Isa::detect();
-        let engine = Engine::new(self.engine, &self.settings, self.pool.clone(), isa)?;
-        let pipeline = Pipeline::with_engine(self.settings.clone(), self.pool.clone(), isa, engine);
+        let pipeline = Pipeline::on(&self.engines, self.settings.clone());
         let worker = Worker {
             place: name.clone(),
             root: self.root.clone(),

@@ -26,7 +26,11 @@
 //! A model, not a measurement: with V = 7 that is 746 P, 57 MB at 320x240 and 229 MB at 640x480. A card of 400 GB/s that
 //! reaches half of it needs 0.3 ms and 1.2 ms; a bus of 12 GB/s adds 0.25 ms and 1.0 ms where everything is learnt.
 
+mod arenas;
+
 mod buffers;
+
+pub mod card;
 
 mod device;
 
@@ -36,6 +40,10 @@ pub mod layout;
 
 pub mod passes;
 
+mod recording;
+
+mod refine;
+
 pub mod residency;
 
 use std::sync::Arc;
@@ -43,19 +51,27 @@ use std::sync::Arc;
 use rayon::ThreadPool;
 
 use self::{
-    device::{Adapters, Device},
+    card::Card,
     frame::{Failure, State, Wanted},
     layout::Rules,
 };
 use super::{
     Answer, Compared, EngineError, Question, compare_on_processor,
     cpu::{CpuEngine, RecallView, Score},
+    refine_on_processor,
 };
 use crate::{
     config::Settings,
     isa::Isa,
-    model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
-    stages::interpolate::prior::Prior,
+    model::{
+        camera::Intrinsics,
+        pose::{Pose, PoseNoise},
+        viewpoint::Viewpoint,
+    },
+    stages::{
+        interpolate::prior::Prior,
+        refine::{PoseRefiner, Refined},
+    },
 };
 
 /// What was moved and done, since the engine was made.
@@ -81,7 +97,7 @@ pub struct Counters {
 pub struct GpuEngine {
     settings: Settings,
     rules: Rules,
-    adapters: Adapters,
+    card: Arc<Card>,
     state: State,
     /// For what does not fit the device.
     processor: CpuEngine,
@@ -91,30 +107,23 @@ pub struct GpuEngine {
 }
 
 impl GpuEngine {
-    /// # Errors
-    /// No adapter, or one that gives no device.
     pub(super) fn new(
-        software_too: bool,
+        card: &Arc<Card>,
         settings: &Settings,
         pool: Arc<ThreadPool>,
         isa: Isa,
-    ) -> Result<Self, EngineError> {
-        let adapters = if software_too {
-            Adapters::Any
-        } else {
-            Adapters::Real
-        };
+    ) -> Self {
         let rules = Rules::new(settings);
-        Ok(Self {
+        Self {
+            state: State::new(card.device(), &rules, settings.views, card.share()),
             settings: settings.clone(),
-            adapters,
-            state: open(adapters, &rules)?,
+            card: Arc::clone(card),
             rules,
             processor: CpuEngine::new(settings, Arc::clone(&pool), isa),
             pool,
             isa,
             counters: Counters::default(),
-        })
+        }
     }
 
     /// Name and kind of the adapter.
@@ -128,7 +137,7 @@ impl GpuEngine {
 
     /// Whether another engine should take over when the device cannot be replaced.
     pub(super) fn falls_back(&self) -> bool {
-        self.adapters == Adapters::Real
+        self.card.falls_back()
     }
 
     pub(super) fn processor(&self) -> &CpuEngine {
@@ -140,9 +149,27 @@ impl GpuEngine {
         CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
     }
 
-    /// Gives the device up, as when a driver fails: the next call finds it lost.
-    pub fn destroy_device(&self) {
-        self.state.device.device.destroy();
+    /// The pose of a frame that is compared next, from its nearest views. `refiner` is for what does not fit the device.
+    pub(super) fn refine(
+        &mut self,
+        question: &Question,
+        noise: PoseNoise,
+        refiner: &mut PoseRefiner,
+    ) -> Result<Refined, EngineError> {
+        let refined = self.persevere(|state, counters| {
+            state.refine(
+                question.views,
+                question.intrinsics,
+                question.world_from_camera,
+                question.image,
+                noise,
+                counters,
+            )
+        })?;
+        Ok(refined.unwrap_or_else(|| {
+            self.counters.on_processor += 1;
+            refine_on_processor(&self.processor, question, noise, refiner)
+        }))
     }
 
     pub(super) fn compare(
@@ -236,19 +263,13 @@ impl GpuEngine {
             reason = lost.0,
             "the device was lost; opening another"
         );
-        self.state = open(self.adapters, &self.rules).map_err(|_| EngineError::Lost(lost.0))?;
+        let device = self.card.replace(&self.state.device);
+        let device = device.map_err(|_| EngineError::Lost(lost.0))?;
+        self.state = State::new(device, &self.rules, self.settings.views, self.card.share());
         match attempt(&mut self.state, &mut self.counters) {
             Ok(done) => Ok(Some(done)),
             Err(Failure::TooLarge) => Ok(None),
             Err(Failure::Lost(lost)) => Err(EngineError::Lost(lost.0)),
         }
-    }
-}
-
-fn open(adapters: Adapters, rules: &Rules) -> Result<State, EngineError> {
-    match Device::open(adapters) {
-        Ok(Some(device)) => Ok(State::new(device, rules)),
-        Ok(None) => Err(EngineError::NoAdapter),
-        Err(lost) => Err(EngineError::Lost(lost.0)),
     }
 }
