@@ -65,8 +65,8 @@ struct Exposure {
 struct Level {
     focal: vec2<f32>,
     center: vec2<f32>,
-    /// Of translation, rotation, gain and offset, as the pose's noise says.
-    precision: array<vec4<f32>, 2>,
+    /// Inverse variances of translation, rotation, gain and offset, as the noise of the pose says.
+    certainty: array<vec4<f32>, 2>,
     width: u32,
     height: u32,
     /// Its first pixel in the pyramid.

@@ -323,7 +323,6 @@ impl Pipeline {
             Ok(refined) => refined,
             Err(error) => {
                 self.workspace = work;
-                self.maps = Maps::default();
                 self.maps_read = true;
                 return Err(FrameError::Engine(error.to_string()));
             }

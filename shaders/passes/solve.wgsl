@@ -86,9 +86,9 @@ fn step(@builtin(local_invocation_index) thread: u32) {
             normal[column][row] = normal[row][column];
             entry += 1u;
         }
-        let precision = level.precision[row / 4u][row % 4u];
-        normal[row][row] += precision;
-        right[row] = sums[HESSIAN + row] * level.inverse_discount - precision * deviation[row];
+        let certainty = level.certainty[row / 4u][row % 4u];
+        normal[row][row] += certainty;
+        right[row] = sums[HESSIAN + row] * level.inverse_discount - certainty * deviation[row];
     }
     let solution = solve_normal(&normal, right);
     if !solution.found {

@@ -93,7 +93,7 @@ pub fn discount(image_pixels: usize, level: usize) -> f64 {
     (CORRELATED_PIXELS * scale / 4f64.powi(level as i32 + 1)).max(1.0)
 }
 
-/// Of the prior of translation, rotation, gain and offset.
+/// Inverse variances of the prior of translation, rotation, gain and offset.
 pub fn precision(noise: PoseNoise) -> [f64; 8] {
     let (m, rad) = (noise.position_m, noise.rotation_rad);
     [m, m, m, rad, rad, rad, GAIN_SD, OFFSET_SD].map(|sd| 1.0 / (sd * sd))

@@ -278,6 +278,7 @@ impl State {
         let Some((_, buffers)) = self.sizes.last().filter(is_last) else {
             return;
         };
+        let evicted = self.arenas.residency.evicted();
         self.arenas.begin(&self.device, std::iter::once(viewpoint));
         // Without room the next recall brings it.
         if let Some(Place::Empty(first)) = self.arenas.place(&self.device, viewpoint) {
@@ -292,6 +293,7 @@ impl State {
             passes.submit();
         }
         counters.resident_bytes = self.arenas.bytes();
+        counters.evicted += self.arenas.residency.evicted() - evicted;
     }
 
     /// Viewpoints changed elsewhere: the next recall brings what it needs.

@@ -176,8 +176,8 @@ pub struct Exposure {
 pub struct Level {
     pub focal: [f32; 2],
     pub center: [f32; 2],
-    /// Of translation, rotation, gain and offset, as the pose's noise says.
-    pub precision: [[f32; 4]; 2],
+    /// Inverse variances of translation, rotation, gain and offset, as the noise of the pose says.
+    pub certainty: [[f32; 4]; 2],
     pub width: u32,
     pub height: u32,
     /// Its first pixel in the pyramid.
@@ -209,7 +209,7 @@ impl Level {
             let level = Self {
                 focal: [camera.fx as f32, camera.fy as f32],
                 center: [camera.cx as f32, camera.cy as f32],
-                precision: [
+                certainty: [
                     std::array::from_fn(|axis| precision[axis]),
                     std::array::from_fn(|axis| precision[4 + axis]),
                 ],

@@ -1,17 +1,27 @@
-//! The engine on a graphics card: the stages in WGSL (`shaders/`), a twin for each, in one list of passes a frame.
+//! The engine on a graphics card: the stages in WGSL (`shaders/`), a twin for each, in two lists of passes a frame.
 //!
 //! Viewpoints stay on the device while there is room; the posterior becomes a viewpoint there without a journey. The
-//! processor keeps every viewpoint too, so a lost device loses nothing that was reported. One frame is in flight: its
-//! report is awaited, because the next frame's prior depends on what is learnt.
+//! processor keeps every viewpoint too, so a lost device loses nothing that was reported. One frame of a place is in
+//! flight: its report is awaited, because the next frame's prior depends on what is learnt. The device and its pipelines
+//! are those of all places.
 //!
-//! Passes a frame: project depth, project triangle, merge, expose, gain, score, block means, and block medians where the
-//! evidence is their median: 8, whatever the number of views. Bytes a frame of P pixels, V views of P pixels:
+//! Two read-backs a frame: the refined pose is awaited before the comparison is recorded, because the views of the
+//! comparison are chosen by it from the whole memory, and those that are not resident are brought. The image goes up
+//! once.
+//!
+//! Passes a frame, whatever the number of views: 13. Refinement has 5: project coarse depth, project coarse triangle,
+//! expect, halve (3 dispatches) and refine (54: depths and begin, twice accumulate and judge, and magnitudes, accumulate
+//! and step four times on each of four levels; coarse ones that the pose's noise does not call for do nothing). The
+//! comparison has 8: project depth, project triangle, merge, expose, gain, score, block means, and block medians where
+//! the evidence is their median. Bytes a frame of P pixels, V views of P pixels:
 //!
 //! | over the bus | bytes | 320x240 |
 //! |---|---|---|
-//! | up: image, and depth of what is learnt | 3 P + 4 P | 0.54 MB |
-//! | up: a view that is not resident | 36 P | 2.76 MB |
-//! | down: evidence, exposure, time stamps | P / 4 + 144 | 19 kB |
+//! | up: image; depth, coarse depth and luminance of what is learnt | 3 P + 7 P | 0.77 MB |
+//! | up: a view that is not resident | 39 P | 3.0 MB |
+//! | up: poses, sizes, levels | < 3 kB | 3 kB |
+//! | down: refined pose, its time stamps | 352 | 0.4 kB |
+//! | down: evidence, exposure, time stamps | P / 4 + 304 | 20 kB |
 //! | down, if it is learnt: the posterior | 32 P | 2.46 MB |
 //! | down, if something surprises: the map | 4 P | 0.31 MB |
 //! | down, if somebody wants the maps | 100 P | 7.7 MB |
@@ -22,9 +32,13 @@
 //! | gather: each record once, if neighbours share the cache | 32 V P |
 //! | the prior written, then read by expose (32 B) and score (64 B, neighbours from the cache) | 160 P |
 //! | image read twice, surprise and posterior written, surprise read, posterior copied | 110 P |
+//! | refinement: the maps of three views of P / 4 pixels, luminance and variance gathered | 33 P |
+//! | the image read, the pyramid written, read by halve and depths | 18 P |
+//! | the pyramid read twice a step, neighbours from the cache: 16 B, 4 steps, P / 3 pixels, and by the judges | 51 P |
 //!
-//! A model, not a measurement: with V = 7 that is 746 P, 57 MB at 320x240 and 229 MB at 640x480. A card of 400 GB/s that
-//! reaches half of it needs 0.3 ms and 1.2 ms; a bus of 12 GB/s adds 0.25 ms and 1.0 ms where everything is learnt.
+//! A model, not a measurement: with V = 7 that is 848 P, 65 MB at 320x240 and 260 MB at 640x480. A card of 400 GB/s that
+//! reaches half of it needs 0.3 ms and 1.3 ms, and 0.3 ms beside if each of the 68 dispatches waits 5 us for the one
+//! before; a bus of 12 GB/s adds 0.27 ms and 1.1 ms where everything is learnt.
 
 mod arenas;
 

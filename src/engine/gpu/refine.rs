@@ -38,6 +38,9 @@ impl State {
         noise: PoseNoise,
         counters: &mut Counters,
     ) -> Result<Refined, Failure> {
+        if views.is_empty() {
+            return Ok(Refined::unchanged(*world_from_camera));
+        }
         let views = &views[..views.len().min(REFINE_VIEWS)];
         let noise = believed(noise);
         let whole = Frame::new(intrinsics.width, intrinsics.height, views.len());
