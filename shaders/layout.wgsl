@@ -60,3 +60,42 @@ struct Exposure {
     /// Pixels that some viewpoint saw.
     seen: u32,
 }
+
+/// A level of the pyramid that refinement looks at, and what holds for all of them. Level 0 is half the image.
+struct Level {
+    focal: vec2<f32>,
+    center: vec2<f32>,
+    /// Inverse variances of translation, rotation, gain and offset, as the noise of the pose says.
+    certainty: array<vec4<f32>, 2>,
+    width: u32,
+    height: u32,
+    /// Its first pixel in the pyramid.
+    first: u32,
+    index: u32,
+    /// Of the level before.
+    finer_width: u32,
+    finer_first: u32,
+    image_width: u32,
+    /// Correlated pixels count less.
+    inverse_discount: f32,
+    /// Of the image, pixels.
+    image_focal: f32,
+    position_sd_m: f32,
+    rotation_sd_rad: f32,
+}
+
+/// What refinement has found so far: the real camera is given * given_from_real, and Y = gain * tau + offset.
+struct Estimate {
+    /// Of given_from_real, a unit quaternion, its real part last.
+    rotation: vec4<f32>,
+    translation: vec3<f32>,
+    gain: f32,
+    /// Sum of the capped residuals and their number: at the last look, and at the one before.
+    mismatch: vec2<f32>,
+    mismatch_before: vec2<f32>,
+    offset: f32,
+    /// 0 where too little is predicted.
+    level_count: u32,
+    /// Comparable pixels of the finest level.
+    point_count: u32,
+}

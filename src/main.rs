@@ -6,8 +6,24 @@ use clap::Parser;
 use surprised::commands::{Arguments, exit_code};
 use tracing_subscriber::EnvFilter;
 
+fn main() -> ExitCode {
+    quieten_drivers();
+    run()
+}
+
+/// wgpu asks the Vulkan loader for windows even where none is wanted. Mesa's device selection then looks for a display
+/// and, where nobody is logged in, complains on standard error. What a user has set is left alone.
+fn quieten_drivers() {
+    let is_set = |name| std::env::var_os(name).is_some();
+    if !is_set("XDG_RUNTIME_DIR") && !is_set("MESA_VK_DEVICE_SELECT") && !is_set("NODEVICE_SELECT")
+    {
+        // SAFETY: this is the only thread.
+        unsafe { std::env::set_var("NODEVICE_SELECT", "1") };
+    }
+}
+
 #[tokio::main]
-async fn main() -> ExitCode {
+async fn run() -> ExitCode {
     let arguments = Arguments::parse();
     // RUST_LOG says what is logged; standard output belongs to answers.
     tracing_subscriber::fmt()

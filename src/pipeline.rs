@@ -9,7 +9,7 @@ use rayon::ThreadPool;
 use crate::{
     config::Settings,
     engine::{
-        Answer, Engine, Question,
+        Answer, Engine, EngineError, Engines, Question,
         cpu::{CpuEngine, Observation, RecallView, Score},
     },
     isa::Isa,
@@ -135,13 +135,13 @@ impl Pipeline {
         Self::with_engine(settings, pool, isa, engine)
     }
 
-    /// With an engine that was made for these settings.
-    pub fn with_engine(
-        settings: Settings,
-        pool: Arc<ThreadPool>,
-        isa: Isa,
-        engine: Engine,
-    ) -> Self {
+    /// Where these engines compute.
+    pub fn on(engines: &Engines, settings: Settings) -> Self {
+        let engine = engines.engine(&settings);
+        Self::with_engine(settings, engines.pool().clone(), engines.isa(), engine)
+    }
+
+    fn with_engine(settings: Settings, pool: Arc<ThreadPool>, isa: Isa, engine: Engine) -> Self {
         Self {
             sides_depth: SidesDepth::new(depth_range(&settings), isa),
             engine,
@@ -400,6 +400,14 @@ impl Pipeline {
         self.engine.observe(&frame.image, &mut work.observation);
 
         let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
+        let refined = match refined {
+            Ok(refined) => refined,
+            Err(error) => {
+                self.workspace = work;
+                self.maps_read = true;
+                return Err(FrameError::Engine(error.to_string()));
+            }
+        };
         let world_from_camera = refined.world_from_camera;
         ended(Stage::Refine);
 
@@ -479,33 +487,23 @@ impl Pipeline {
         observation: &Observation,
         visit: &Visit,
         selected: &mut Vec<usize>,
-    ) -> Refined {
+    ) -> Result<Refined, EngineError> {
         if !self.settings.refine_pose {
-            return Refined::unchanged(frame.world_from_camera);
+            return Ok(Refined::unchanged(frame.world_from_camera));
         }
         let noise = frame
             .pose_noise
             .unwrap_or_else(|| self.settings.pose_noise(&frame.source.robot));
         self.select(&frame.world_from_camera, selected);
         selected.truncate(REFINE_VIEWS);
-        let recalled = recall_views(&self.memory, &self.settings, selected, visit);
-        let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = recalled
-            .iter()
-            .map(|view| {
-                (
-                    &view.viewpoint.coarse,
-                    &view.viewpoint.world_from_camera,
-                    view.weight,
-                )
-            })
-            .collect();
-        self.refiner.refine(
-            &views,
-            &observation.planes[0],
-            &frame.intrinsics,
-            &frame.world_from_camera,
-            noise,
-        )
+        let question = Question {
+            views: &recall_views(&self.memory, &self.settings, selected, visit),
+            intrinsics: &frame.intrinsics,
+            world_from_camera: &frame.world_from_camera,
+            image: &frame.image,
+            observation,
+        };
+        self.engine.refine(&question, noise, &mut self.refiner)
     }
 
     fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {

@@ -5,7 +5,9 @@ use std::{fmt::Write as _, fs, path::Path, sync::Arc};
 use surprised::{
     config::Settings,
     dataset::{self, Recording},
+    engine::{EngineKind, Engines},
     evaluation::held_out::{self, HeldOut},
+    isa::Isa,
 };
 use tempfile::TempDir;
 
@@ -68,7 +70,8 @@ fn evaluated(step_m: f64, grey: impl Fn(u32, f64, f64) -> u8) -> HeldOut {
     let recording = recording(folder.path(), 25, step_m, grey);
     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build();
     let pool = Arc::new(pool.expect("threads start"));
-    let found = held_out::evaluate(&recording, &Settings::robust(), &pool);
+    let engines = Engines::new(EngineKind::Cpu, pool, Isa::detect()).expect("there is a processor");
+    let found = held_out::evaluate(&recording, &Settings::robust(), &engines);
     let found = found.expect("every frame can be used");
     assert_eq!(
         (found.learnt, found.left_out),

@@ -9,7 +9,7 @@ use naga::{
 };
 use surprised::{
     engine::gpu::{
-        layout::{Exposure, Frame, Rules, View},
+        layout::{Estimate, Exposure, Frame, Level, Rules, View},
         passes::{EXPOSE, EXPOSE_PIXELS, HISTOGRAM_WORDS, PASSES, Pass},
     },
     stages::interpolate::merge::VIEWS_MAX,
@@ -55,7 +55,7 @@ fn every_shader_file_is_part_of_a_pass() {
             }
         }
     }
-    assert!(files >= 15, "only {files} shader files were found");
+    assert!(files >= 19, "only {files} shader files were found");
 }
 
 #[test]
@@ -171,6 +171,32 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             inverse_gain,
             seen
         }),
+        layout!(Level {
+            focal,
+            center,
+            certainty,
+            width,
+            height,
+            first,
+            index,
+            finer_width,
+            finer_first,
+            image_width,
+            inverse_discount,
+            image_focal,
+            position_sd_m,
+            rotation_sd_rad,
+        }),
+        layout!(Estimate {
+            rotation,
+            translation,
+            gain,
+            mismatch,
+            mismatch_before,
+            offset,
+            level_count,
+            point_count,
+        }),
     ];
     for (name, fields, size) in structs {
         let mut found = 0;
@@ -252,6 +278,12 @@ fn all_rust_constants() -> BTreeMap<String, Vec<f64>> {
     found.insert("THREADS".into(), vec![PASSES[EXPOSE].workgroup[0].into()]);
     found.insert("VIEWS_MAX".into(), vec![VIEWS_MAX as f64]);
     found.insert("BINS".into(), vec![(HISTOGRAM_WORDS - 1) as f64]);
+    // What follows from others.
+    let largest = found["SCALE_MAX"][0] / found["NORMAL_FROM_MEDIAN"][0];
+    found.insert("MAGNITUDE_MAX".into(), vec![largest]);
+    let first = (found["NEAR_M"][0] as f32).to_bits() >> 16;
+    found.insert("DEPTH_BITS_FIRST".into(), vec![first.into()]);
+    found.insert("DEPTH_BITS_SHIFT".into(), vec![16.0]);
     found
 }
 

@@ -6,11 +6,13 @@ use std::{path::PathBuf, sync::Arc};
 use surprised::{
     config::{Preset, Settings},
     dataset::{self, Recording},
+    engine::{EngineKind, Engines},
     evaluation::{
         measure::{Conditions, measure},
         method::{Method, MethodKind},
         summary::{Headline, headline, passes},
     },
+    isa::Isa,
 };
 
 fn recordings() -> Option<Vec<Recording>> {
@@ -35,8 +37,9 @@ fn the_paper_finds_a_new_cup_better_than_differencing_and_forgives_its_removal()
             .build()
             .expect("threads start"),
     );
+    let engines = Engines::new(EngineKind::Cpu, pool, Isa::detect()).expect("there is a processor");
     let run = |kind: MethodKind| -> Headline {
-        let mut method = Method::new(kind, &settings, &pool);
+        let mut method = Method::new(kind, &settings, &engines);
         let rows = measure(
             &recordings,
             &mut method,

@@ -17,13 +17,13 @@ use std::{
 
 use anyhow::Context;
 use nalgebra::Point3;
-use rayon::ThreadPool;
 use serde::Serialize;
 use tempfile::TempDir;
 
 use crate::{
     config::{Evidence, Preset, Settings},
     dataset::{self, Recording},
+    engine::{EngineKind, Engines},
     evaluation::{
         figures,
         measure::{AddedNoise, Conditions, FrameRow, Ignored, Seen, measure},
@@ -31,6 +31,7 @@ use crate::{
         summary::{BoxSummary, Headline, ObjectSummary, PassSummary, boxes, headline, passes},
         table::{Table, number},
     },
+    isa::Isa,
     simulation::{script::Script, write},
 };
 
@@ -57,6 +58,9 @@ pub struct EvaluateArgs {
     /// Settings (TOML) over the preset.
     #[arg(long, value_name = "FILE")]
     settings: Option<PathBuf>,
+    /// Where recall and surprise are computed.
+    #[arg(long, value_enum, default_value_t)]
+    engine: EngineKind,
     /// Write a row for each frame and method.
     #[arg(long, value_name = "FILE")]
     csv: Option<PathBuf>,
@@ -172,8 +176,9 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
             .num_threads(settings.threads)
             .build()?,
     );
+    let engines = Engines::new(arguments.engine, pool, Isa::detect())?;
     if arguments.prior {
-        return prior::run(&recordings, &settings, &pool, arguments.json);
+        return prior::run(&recordings, &settings, &engines, arguments.json);
     }
     let noisy = arguments.pose_noise_m > 0.0 || arguments.pose_noise_deg > 0.0;
     let conditions = Conditions {
@@ -195,7 +200,7 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         .enumerate()
         .map(|(number, trial)| {
             let figures = arguments.figures.as_deref().filter(|_| number == 0);
-            outcome(trial, &recordings, &conditions, &pool, figures)
+            outcome(trial, &recordings, &conditions, &engines, figures)
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
 
@@ -271,7 +276,7 @@ fn outcome(
     trial: &Trial,
     recordings: &[Recording],
     conditions: &Conditions,
-    pool: &Arc<ThreadPool>,
+    engines: &Engines,
     figures: Option<&Path>,
 ) -> anyhow::Result<Outcome> {
     let sampled = figures::sample_frames(recordings);
@@ -291,7 +296,7 @@ fn outcome(
         }
     };
     let play = |conditions: &Conditions, each: &mut dyn FnMut(&Seen)| {
-        let mut method = Method::new(trial.kind, &trial.settings, pool);
+        let mut method = Method::new(trial.kind, &trial.settings, engines);
         measure(recordings, &mut method, &trial.settings, conditions, each)
     };
     let rows = play(conditions, &mut draw)?;

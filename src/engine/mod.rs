@@ -6,6 +6,7 @@ pub mod gpu;
 
 use std::sync::Arc;
 
+use arrayvec::ArrayVec;
 use rayon::ThreadPool;
 
 use crate::{
@@ -15,18 +16,22 @@ use crate::{
         belief::Record,
         camera::Intrinsics,
         frame::RgbImage,
-        pose::Pose,
+        pose::{Pose, PoseNoise},
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
     stages::{
         attend::BlockMap,
         interpolate::prior::{self, Prior},
+        refine::{PoseRefiner, REFINE_VIEWS, Refined},
     },
 };
 
 use self::{
     cpu::{CpuEngine, Observation, RecallView, Score},
-    gpu::GpuEngine,
+    gpu::{
+        GpuEngine,
+        card::{Card, CardRules},
+    },
 };
 
 /// Which engine is asked for.
@@ -58,7 +63,7 @@ pub struct Question<'a> {
     pub intrinsics: &'a Intrinsics,
     pub world_from_camera: &'a Pose,
     pub image: &'a RgbImage,
-    /// The image in luminance and chrominance.
+    /// The image in luminance and chrominance, as [`Engine::observe`] leaves it.
     pub observation: &'a Observation,
 }
 
@@ -87,32 +92,88 @@ pub enum Engine {
     Gpu(Box<GpuEngine>),
 }
 
-impl Engine {
-    /// `pool` may be shared among engines; each engine opens its own device.
-    ///
+/// Makes the engines of a process, all on one card.
+pub struct Engines {
+    /// `None`: the processor alone.
+    card: Option<Arc<Card>>,
+    pool: Arc<ThreadPool>,
+    isa: Isa,
+}
+
+impl Engines {
     /// # Errors
     /// `Gpu` was asked for and there is none.
-    pub fn new(
-        kind: EngineKind,
-        settings: &Settings,
-        pool: Arc<ThreadPool>,
-        isa: Isa,
-    ) -> Result<Self, EngineError> {
-        let gpu = |software_too| {
-            GpuEngine::new(software_too, settings, Arc::clone(&pool), isa)
-                .map(|engine| Self::Gpu(Box::new(engine)))
-        };
-        match kind {
-            EngineKind::Gpu => gpu(true),
-            EngineKind::Auto => match gpu(false) {
-                Err(EngineError::Lost(reason)) => {
-                    tracing::warn!(reason, "the graphics card cannot be used");
-                    Ok(Self::Cpu(CpuEngine::new(settings, pool, isa)))
+    pub fn new(kind: EngineKind, pool: Arc<ThreadPool>, isa: Isa) -> Result<Self, EngineError> {
+        let card = match kind {
+            EngineKind::Cpu => None,
+            EngineKind::Gpu => Some(Card::open(CardRules::any())?),
+            EngineKind::Auto => match Card::open(CardRules::auto()) {
+                Ok(card) => Some(card),
+                Err(EngineError::NoAdapter) => None,
+                Err(error) => {
+                    tracing::warn!(%error, "the graphics card cannot be used");
+                    None
                 }
-                Err(EngineError::NoAdapter) => Ok(Self::Cpu(CpuEngine::new(settings, pool, isa))),
-                Ok(engine) => Ok(engine),
             },
-            EngineKind::Cpu => Ok(Self::Cpu(CpuEngine::new(settings, pool, isa))),
+        };
+        Ok(Self { card, pool, isa })
+    }
+
+    /// On a card that was chosen otherwise.
+    pub fn on(card: Arc<Card>, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+        Self {
+            card: Some(card),
+            pool,
+            isa,
+        }
+    }
+
+    /// A place's.
+    pub fn engine(&self, settings: &Settings) -> Engine {
+        let pool = Arc::clone(&self.pool);
+        match &self.card {
+            Some(card) if card.works() || !card.falls_back() => {
+                Engine::Gpu(Box::new(GpuEngine::new(card, settings, pool, self.isa)))
+            }
+            _ => Engine::Cpu(CpuEngine::new(settings, pool, self.isa)),
+        }
+    }
+
+    pub fn card(&self) -> Option<&Card> {
+        self.card.as_deref()
+    }
+
+    pub fn pool(&self) -> &Arc<ThreadPool> {
+        &self.pool
+    }
+
+    pub fn isa(&self) -> Isa {
+        self.isa
+    }
+}
+
+impl Engine {
+    /// The pose of an image, corrected against what its nearest views expect. [`Self::compare`] must follow with the same
+    /// image. `refiner` is used where the processor computes.
+    ///
+    /// # Errors
+    /// As [`Self::compare`].
+    pub fn refine(
+        &mut self,
+        question: &Question,
+        noise: PoseNoise,
+        refiner: &mut PoseRefiner,
+    ) -> Result<Refined, EngineError> {
+        let gpu = match self {
+            Self::Cpu(engine) => return Ok(refine_on_processor(engine, question, noise, refiner)),
+            Self::Gpu(gpu) => gpu,
+        };
+        match gpu.refine(question, noise, refiner) {
+            Err(error) if gpu.falls_back() => {
+                self.fall_back(&error);
+                self.refine(question, noise, refiner)
+            }
+            result => result,
         }
     }
 
@@ -141,17 +202,27 @@ impl Engine {
         };
         match gpu.compare(question, learn, &mut answer) {
             Err(error) if gpu.falls_back() => {
-                tracing::error!(%error, "going on with the processor");
-                *self = Self::Cpu(gpu.fallback());
+                self.fall_back(&error);
                 self.compare(question, evidence, learn, answer)
             }
             result => result,
         }
     }
 
-    /// Takes an image apart into planes; memory that is there is used again.
+    /// The processor takes over.
+    fn fall_back(&mut self, error: &EngineError) {
+        if let Self::Gpu(gpu) = self {
+            tracing::error!(%error, "going on with the processor");
+            *self = Self::Cpu(gpu.fallback());
+        }
+    }
+
+    /// Takes an image apart into planes, where they are needed; memory that is there is used again.
     pub fn observe(&self, image: &RgbImage, observation: &mut Observation) {
-        self.processor().observe(image, observation);
+        match self {
+            Self::Cpu(engine) => engine.observe(image, observation),
+            Self::Gpu(_) => *observation = Observation::default(),
+        }
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
@@ -222,6 +293,47 @@ impl Engine {
     }
 }
 
+/// Works with the image in planes, which a card has no need of.
+fn observed<T>(engine: &CpuEngine, question: &Question, work: impl FnOnce(&Observation) -> T) -> T {
+    let known = question.observation;
+    if (known.width, known.height) == (question.image.width, question.image.height) {
+        return work(known);
+    }
+    let mut own = Observation::default();
+    engine.observe(question.image, &mut own);
+    work(&own)
+}
+
+fn refine_on_processor(
+    engine: &CpuEngine,
+    question: &Question,
+    noise: PoseNoise,
+    refiner: &mut PoseRefiner,
+) -> Refined {
+    let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = question
+        .views
+        .iter()
+        .take(REFINE_VIEWS)
+        .map(|view| {
+            let Viewpoint {
+                coarse,
+                world_from_camera,
+                ..
+            } = view.viewpoint;
+            (coarse, world_from_camera, view.weight)
+        })
+        .collect();
+    observed(engine, question, |observation| {
+        refiner.refine(
+            &views,
+            &observation.planes[0],
+            question.intrinsics,
+            question.world_from_camera,
+            noise,
+        )
+    })
+}
+
 fn compare_on_processor(
     engine: &CpuEngine,
     question: &Question,
@@ -240,7 +352,9 @@ fn compare_on_processor(
         question.world_from_camera,
         prior,
     );
-    engine.score(prior, question.observation, score);
+    observed(engine, question, |observation| {
+        engine.score(prior, observation, score);
+    });
     found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {
         seen: prior

@@ -6,17 +6,16 @@
 //! Pictures are compared in grey levels, as they came, and with one gain a frame that is fitted to the left out frame: a
 //! memory that looks past exposures has the exposure of its first frames.
 
-use std::sync::Arc;
-
-use rayon::ThreadPool;
 use serde::Serialize;
 
 use crate::{
     config::Settings,
     dataset::Recording,
-    engine::cpu::{CpuEngine, RecallView},
+    engine::{
+        Engines,
+        cpu::{CpuEngine, RecallView},
+    },
     evaluation::measure::MeasureError,
-    isa::Isa,
     model::{
         belief::{Belief, CHANNELS, Record, rgb_from_ycbcr, ycbcr_from_rgb},
         frame::{Frame, Source},
@@ -79,7 +78,7 @@ type Predicted = Vec<Option<[f32; CHANNELS]>>;
 pub fn evaluate(
     recording: &Recording,
     settings: &Settings,
-    pool: &Arc<ThreadPool>,
+    engines: &Engines,
 ) -> Result<HeldOut, MeasureError> {
     let moments = &recording.truth.moments;
     let begins = (0..recording.entries.len()).filter(|&index| {
@@ -105,14 +104,14 @@ pub fn evaluate(
         stamp_s: recording.entries[index].stamp_s,
         error,
     };
-    let mut pipeline = Pipeline::new(settings.clone(), pool.clone());
+    let mut pipeline = Pipeline::on(engines, settings.clone());
     for &index in &learnt {
         let frame = recording.frame(index, &source)?;
         pipeline
             .process(&frame)
             .map_err(|error| refused(index, error))?;
     }
-    let engine = CpuEngine::new(settings, pool.clone(), Isa::detect());
+    let engine = CpuEngine::new(settings, engines.pool().clone(), engines.isa());
     let names = [
         "prior",
         "prior, pose refined",

@@ -1,11 +1,8 @@
 //! What is compared: a preset's pipeline and image differencing behind one door.
 
-use std::sync::Arc;
-
-use rayon::ThreadPool;
-
 use crate::{
     config::Settings,
+    engine::Engines,
     evaluation::differencing::{Differencing, Helps},
     model::{
         camera::Intrinsics,
@@ -75,21 +72,16 @@ pub enum Method {
 }
 
 impl Method {
-    pub fn new(kind: MethodKind, settings: &Settings, pool: &Arc<ThreadPool>) -> Self {
+    /// Image differencing computes on the processor, whatever the engines are.
+    pub fn new(kind: MethodKind, settings: &Settings, engines: &Engines) -> Self {
+        let differencing = |helps| {
+            let differencing = Differencing::new(settings, helps, engines.pool().clone());
+            Self::Difference(Box::new(differencing))
+        };
         match kind {
-            MethodKind::Preset => {
-                Self::Preset(Box::new(Pipeline::new(settings.clone(), pool.clone())))
-            }
-            MethodKind::Diff => Self::Difference(Box::new(Differencing::new(
-                settings,
-                Helps::NONE,
-                pool.clone(),
-            ))),
-            MethodKind::DiffAll => Self::Difference(Box::new(Differencing::new(
-                settings,
-                Helps::of(settings),
-                pool.clone(),
-            ))),
+            MethodKind::Preset => Self::Preset(Box::new(Pipeline::on(engines, settings.clone()))),
+            MethodKind::Diff => differencing(Helps::NONE),
+            MethodKind::DiffAll => differencing(Helps::of(settings)),
         }
     }
 

@@ -56,7 +56,7 @@ use self::{
 };
 use crate::{
     config::{ConfigError, Settings},
-    engine::{Engine, EngineError, EngineKind},
+    engine::{EngineError, EngineKind, Engines},
     isa::Isa,
     memory::store::{RETRY_MAX, Store},
     wire::{decode::Limits, keys},
@@ -185,10 +185,7 @@ impl Service {
             .build()
             .map_err(|error| ServeError::Threads(error.to_string()))?;
         let pool = Arc::new(pool);
-        if engine == EngineKind::Gpu {
-            // Each place opens its own device; that there is one is known before anything is promised.
-            Engine::new(engine, &settings, pool.clone(), Isa::detect())?;
-        }
+        let engines = Engines::new(engine, pool, Isa::detect())?;
         let session = zenoh::open(config).await.map_err(ServeError::Zenoh)?;
         let locators = session::locators(&session);
         drop(session_latch);
@@ -198,10 +195,9 @@ impl Service {
         let (places, starts) = Places::new(
             settings,
             store,
-            engine,
+            engines,
             root.into(),
             session,
-            pool,
             failed,
             http.is_some().then_some(news),
         );

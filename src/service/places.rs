@@ -7,7 +7,6 @@ use std::{
     thread::JoinHandle,
 };
 
-use rayon::ThreadPool;
 use tokio::{
     runtime::Handle,
     sync::{mpsc, watch},
@@ -25,8 +24,7 @@ use super::{
 };
 use crate::{
     config::Settings,
-    engine::{Engine, EngineKind},
-    isa::Isa,
+    engine::Engines,
     memory::store::{PlaceOptions, PlaceStore, Store},
     model::refusal::Refusal,
     pipeline::Pipeline,
@@ -58,10 +56,9 @@ pub struct Places {
     /// Where memories last; `None`: they end with the service.
     pub store: Option<Store>,
     runtime: Handle,
-    engine: EngineKind,
+    pub engines: Engines,
     pub root: Arc<str>,
     pub session: Session,
-    pool: Arc<ThreadPool>,
     places: RwLock<BTreeMap<Arc<str>, Arc<Place>>>,
     running: Mutex<Vec<Running>>,
     /// Told the name of each place whose worker has panicked or cannot start.
@@ -84,10 +81,9 @@ impl Places {
     pub fn new(
         settings: Settings,
         store: Option<Store>,
-        engine: EngineKind,
+        engines: Engines,
         root: Arc<str>,
         session: Session,
-        pool: Arc<ThreadPool>,
         failures: mpsc::UnboundedSender<String>,
         news: Option<mpsc::Sender<News>>,
     ) -> (Self, Starts) {
@@ -96,10 +92,9 @@ impl Places {
             settings,
             store,
             runtime: Handle::current(),
-            engine,
+            engines,
             root,
             session,
-            pool,
             places: RwLock::default(),
             running: Mutex::default(),
             failures,
@@ -195,9 +190,7 @@ impl Places {
         };
         let token = keys::live_service(&self.root, name, &self.session.zid().to_string());
         let token = self.session.liveliness().declare_token(token).wait()?;
-        let isa = Isa::detect();
-        let engine = Engine::new(self.engine, &self.settings, self.pool.clone(), isa)?;
-        let pipeline = Pipeline::with_engine(self.settings.clone(), self.pool.clone(), isa, engine);
+        let pipeline = Pipeline::on(&self.engines, self.settings.clone());
         let memory = self.store.as_ref().map(|store| {
             let inbox = place.inbox.clone();
             let options = PlaceOptions::new(&self.settings);

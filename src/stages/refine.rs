@@ -37,10 +37,12 @@ const CORRELATED_PIXELS_OF: f64 = 320.0 * 240.0;
 const SENSOR_VARIANCE: f32 = 9.0;
 /// Tukey's constant: 95 % efficiency for normal errors.
 const TUKEY: f32 = 4.685;
+/// Standard deviation of normal errors from the median of their magnitude.
+const NORMAL_FROM_MEDIAN: f32 = 1.4826;
 /// Bounds of the residuals' scale, in predicted standard deviations.
 const SCALE_MIN: f32 = 0.1;
 const SCALE_MAX: f32 = 3.0;
-const ITERATIONS: usize = 4;
+pub const ITERATIONS: usize = 4;
 /// A correction beyond this many standard deviations of the stated noise is refused. 6 makes frames flash.
 const CORRECTION_SD_MAX: f64 = 20.0;
 /// Where a residual stops counting in the test whether refinement helped, predicted standard deviations.
@@ -49,11 +51,11 @@ const RESIDUAL_CAP: f32 = 4.0;
 /// offset alone make any two images fit better than before, so improvement is no proof.
 const MISMATCH_MAX: f64 = 2.0;
 /// Fewer comparable pixels on a level say nothing about a pose.
-const PIXELS_MIN: usize = 200;
+pub const PIXELS_MIN: usize = 200;
 /// Expected pose error, pixels of the full image, from which a third and a fourth level are needed to catch it.
 const THIRD_LEVEL_PX: f64 = 2.5;
 const FOURTH_LEVEL_PX: f64 = 4.0;
-const LEVELS_MAX: usize = 4;
+pub const LEVELS_MAX: usize = 4;
 /// Views whose depth differs by more than this share from the middle one do not predict a pixel.
 const DEPTH_TOLERANCE: f32 = 0.03;
 
@@ -75,6 +77,52 @@ impl Refined {
             correction_rad: 0.0,
         }
     }
+}
+
+/// The noise that refinement assumes.
+pub fn believed(noise: PoseNoise) -> PoseNoise {
+    PoseNoise {
+        position_m: noise.position_m.max(POSITION_SD_MIN_M),
+        rotation_rad: noise.rotation_rad.max(ROTATION_SD_MIN_RAD),
+    }
+}
+
+/// How many pixels of a level count as one; level 0 is half the image, which has so many.
+pub fn discount(image_pixels: usize, level: usize) -> f64 {
+    let scale = image_pixels as f64 / CORRELATED_PIXELS_OF;
+    (CORRELATED_PIXELS * scale / 4f64.powi(level as i32 + 1)).max(1.0)
+}
+
+/// Inverse variances of the prior of translation, rotation, gain and offset.
+pub fn precision(noise: PoseNoise) -> [f64; 8] {
+    let (m, rad) = (noise.position_m, noise.rotation_rad);
+    [m, m, m, rad, rad, rad, GAIN_SD, OFFSET_SD].map(|sd| 1.0 / (sd * sd))
+}
+
+/// The refined pose, if it explains the image better than the given one and lies within what the noise allows.
+/// Mismatches are mean capped residuals, predicted standard deviations.
+pub fn accepted(
+    world_from_given: &Pose,
+    given_from_real: &Pose,
+    noise: PoseNoise,
+    mismatch_before: f64,
+    mismatch_after: f64,
+) -> Option<Refined> {
+    let improved = mismatch_after < MISMATCH_MAX && mismatch_after < mismatch_before;
+    let motion = logarithm(given_from_real);
+    let in_bounds = (0..6).all(|axis| {
+        let sd = if axis < 3 {
+            noise.position_m
+        } else {
+            noise.rotation_rad
+        };
+        motion[axis].abs() < CORRECTION_SD_MAX * sd
+    });
+    (improved && in_bounds).then(|| Refined {
+        world_from_camera: world_from_given * given_from_real,
+        correction_m: given_from_real.translation.vector.norm(),
+        correction_rad: given_from_real.rotation.angle(),
+    })
 }
 
 /// Luminance, variance and depth that the memory predicts, or what was observed, at one resolution.
@@ -184,10 +232,7 @@ impl PoseRefiner {
         noise: PoseNoise,
     ) -> Refined {
         let unchanged = Refined::unchanged(*world_from_camera);
-        let noise = PoseNoise {
-            position_m: noise.position_m.max(POSITION_SD_MIN_M),
-            rotation_rad: noise.rotation_rad.max(ROTATION_SD_MIN_RAD),
-        };
+        let noise = believed(noise);
         let mut pyramid = std::mem::take(&mut self.pyramid);
         pyramid.resize_with(LEVELS_MAX, Default::default);
         let refined = self.refine_levels(
@@ -238,15 +283,13 @@ impl PoseRefiner {
             offset: 0.0,
         };
         let mut estimate = start;
-        let mut improved = false;
+        let mut mismatches = None;
         for (index, (camera, level)) in pyramid.iter().enumerate().rev() {
             collect_points(self.isa, level, camera, &mut self.points);
             if self.points.count < PIXELS_MIN {
                 continue;
             }
-            // The finest level is half the image, so level 1.
-            let scale = intrinsics.pixels() as f64 / CORRELATED_PIXELS_OF;
-            let discount = (CORRELATED_PIXELS * scale / 4f64.powi(index as i32 + 1)).max(1.0);
+            let discount = discount(intrinsics.pixels(), index);
             for _ in 0..ITERATIONS {
                 let Some(next) = self.step(&estimate, level, camera, noise, discount) else {
                     break;
@@ -254,24 +297,18 @@ impl PoseRefiner {
                 estimate = next;
             }
             if index == 0 {
-                let after = self.mismatch(&estimate, level, camera);
-                improved = after < MISMATCH_MAX && after < self.mismatch(&start, level, camera);
+                let before = self.mismatch(&start, level, camera);
+                mismatches = Some((before, self.mismatch(&estimate, level, camera)));
             }
         }
-        let motion = logarithm(&estimate.given_from_real);
-        let in_bounds = (0..6).all(|axis| {
-            let sd = if axis < 3 {
-                noise.position_m
-            } else {
-                noise.rotation_rad
-            };
-            motion[axis].abs() < CORRECTION_SD_MAX * sd
-        });
-        (improved && in_bounds).then(|| Refined {
-            world_from_camera: world_from_camera * estimate.given_from_real,
-            correction_m: estimate.given_from_real.translation.vector.norm(),
-            correction_rad: estimate.given_from_real.rotation.angle(),
-        })
+        let (before, after) = mismatches?;
+        accepted(
+            world_from_camera,
+            &estimate.given_from_real,
+            noise,
+            before,
+            after,
+        )
     }
 
     /// The views' luminance, variance and depth at the given pose.
@@ -346,14 +383,12 @@ impl PoseRefiner {
         }
         let mut right = Vector8::from_column_slice(gradient_sum) / discount;
         let motion = logarithm(&estimate.given_from_real);
-        for axis in 0..8 {
-            let (sd, deviation) = match axis {
-                0..3 => (noise.position_m, motion[axis]),
-                3..6 => (noise.rotation_rad, motion[axis]),
-                6 => (GAIN_SD, estimate.gain - 1.0),
-                _ => (OFFSET_SD, estimate.offset),
+        for (axis, precision) in precision(noise).into_iter().enumerate() {
+            let deviation = match axis {
+                0..6 => motion[axis],
+                6 => estimate.gain - 1.0,
+                _ => estimate.offset,
             };
-            let precision = 1.0 / (sd * sd);
             normal[(axis, axis)] += precision;
             right[axis] -= precision * deviation;
         }
@@ -431,7 +466,7 @@ impl PoseRefiner {
             .filter(|(residual, _)| !residual.is_nan())
             .map(|(residual, inverse_sd)| residual.abs() * inverse_sd);
         let median = middle(magnitudes, &mut self.magnitudes);
-        (1.4826 * median).clamp(SCALE_MIN, SCALE_MAX)
+        (NORMAL_FROM_MEDIAN * median).clamp(SCALE_MIN, SCALE_MAX)
     }
 
     /// Mean capped residual, predicted standard deviations.

@@ -12,6 +12,8 @@ pub mod joint;
 
 pub mod recall;
 
+pub mod room;
+
 pub mod scene;
 
 use surprised::isa::Isa;

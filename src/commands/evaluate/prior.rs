@@ -1,13 +1,11 @@
 //! `evaluate DIR --prior`: how well the memory tells what is seen from where nobody stood.
 
-use std::sync::Arc;
-
-use rayon::ThreadPool;
 use serde_json::json;
 
 use crate::{
     config::Settings,
     dataset::Recording,
+    engine::Engines,
     evaluation::{
         held_out,
         table::{Table, number},
@@ -19,7 +17,7 @@ use crate::{
 pub fn run(
     recordings: &[Recording],
     settings: &Settings,
-    pool: &Arc<ThreadPool>,
+    engines: &Engines,
     as_json: bool,
 ) -> anyhow::Result<()> {
     let mut table = Table::new(&[
@@ -35,7 +33,7 @@ pub fn run(
     ]);
     let mut results = Vec::new();
     for recording in recordings {
-        let held_out = held_out::evaluate(recording, settings, pool)?;
+        let held_out = held_out::evaluate(recording, settings, engines)?;
         for of in &held_out.predictions {
             table.row(vec![
                 of.name.to_owned(),

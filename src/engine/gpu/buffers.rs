@@ -1,20 +1,17 @@
-//! What lies on the device: arenas of resident viewpoints, and the buffers of one image size. Every buffer carries the
-//! name of the shaders' variable.
+//! What lies on the device beside the resident viewpoints: what all images share, and the buffers of one image size.
+//! Every buffer carries the name of the shaders' variable.
 
 use wgpu::BufferUsages;
 
 use super::{
+    arenas::Arenas,
     device::Device,
-    layout::{Exposure, Frame, Rules, View},
-    passes::{HISTOGRAM_WORDS, PASSES, Slot},
-    residency::{BYTES_PER_PIXEL, Place, Residency},
+    layout::{Estimate, Exposure, Frame, Level, Rules, View},
+    passes::{HISTOGRAM_WORDS, PASSES, REFINE_PIXELS, REFINE_THREADS, SUMS, Slot},
 };
 use crate::{
-    model::{
-        belief::Record,
-        viewpoint::{Mesh, Viewpoint},
-    },
-    stages::interpolate::merge::VIEWS_MAX,
+    model::belief::Record,
+    stages::{interpolate::merge::VIEWS_MAX, refine::LEVELS_MAX},
 };
 
 pub const DEPTH_BYTES: u64 = size_of::<f32>() as u64;
@@ -22,19 +19,25 @@ pub const RECORD_BYTES: u64 = size_of::<Record>() as u64;
 /// alpha and beta; tau and p2; sigma and depth; tau2 and coverage.
 pub const PRIOR_BYTES: u64 = 4 * size_of::<f32>() as u64;
 pub const EXPOSURE_BYTES: u64 = size_of::<Exposure>().next_multiple_of(16) as u64;
+pub const ESTIMATE_BYTES: u64 = size_of::<Estimate>() as u64;
+/// Luminance, variance, depth and observation.
+const PYRAMID_BYTES: u64 = 4 * size_of::<f32>() as u64;
+/// Levels lie as far apart as every device allows bindings to begin.
+const LEVEL_STRIDE: u64 = 256;
 /// Begin and end of every pass.
 pub const STAMPS_BYTES: u64 = (PASSES.len() * 2 * size_of::<u64>()) as u64;
-
-/// At the start: seven viewpoints of 320x240.
-const ARENA_PIXELS: u64 = 7 * 320 * 240;
-/// At most: what seven viewpoints of 2 megapixels or 190 of 320x240 take, a share of a small card's memory.
-const ARENA_BYTES_MAX: u64 = 512 << 20;
 
 /// Of all images alike.
 pub struct SharedBuffers {
     frame: wgpu::Buffer,
     rules: wgpu::Buffer,
     views: wgpu::Buffer,
+    half_frame: wgpu::Buffer,
+    coarse_views: wgpu::Buffer,
+    levels: wgpu::Buffer,
+    pub estimate: wgpu::Buffer,
+    /// What refinement reads: the estimate, and time stamps.
+    pub refined: wgpu::Buffer,
     pub histogram: wgpu::Buffer,
     pub exposure: wgpu::Buffer,
     pub stamps: wgpu::Buffer,
@@ -48,6 +51,23 @@ impl SharedBuffers {
             frame: device.buffer("frame", size_of::<Frame>() as u64, uniform),
             rules: device.buffer("rules", size_of::<Rules>() as u64, uniform),
             views: device.buffer("views", (VIEWS_MAX * size_of::<View>()) as u64, uniform),
+            half_frame: device.buffer("half_frame", size_of::<Frame>() as u64, uniform),
+            coarse_views: device.buffer(
+                "coarse_views",
+                (VIEWS_MAX * size_of::<View>()) as u64,
+                uniform,
+            ),
+            levels: device.buffer("levels", LEVEL_STRIDE * LEVELS_MAX as u64, uniform),
+            estimate: device.buffer(
+                "estimate",
+                ESTIMATE_BYTES,
+                storage | BufferUsages::UNIFORM | BufferUsages::COPY_SRC,
+            ),
+            refined: device.buffer(
+                "refined",
+                ESTIMATE_BYTES + STAMPS_BYTES,
+                BufferUsages::COPY_DST | BufferUsages::MAP_READ,
+            ),
             histogram: device.buffer("histogram", 4 * HISTOGRAM_WORDS, storage),
             exposure: device.buffer(
                 "exposure",
@@ -70,87 +90,21 @@ impl SharedBuffers {
         device.upload(&self.views, 0, bytemuck::cast_slice(views));
         (size_of::<Frame>() + size_of_val(views)) as u64
     }
-}
 
-/// Depth and records of the resident viewpoints, one after the other.
-pub struct Arenas {
-    pub residency: Residency,
-    depth: wgpu::Buffer,
-    pub records: wgpu::Buffer,
-}
-
-impl Arenas {
-    pub fn new(device: &Device) -> Self {
-        let most = (device.buffer_max() / RECORD_BYTES).min(ARENA_BYTES_MAX / BYTES_PER_PIXEL);
-        let residency = Residency::new(ARENA_PIXELS, most);
-        let (depth, records) = Self::buffers(device, residency.capacity());
-        Self {
-            residency,
-            depth,
-            records,
+    /// The same for refinement.
+    pub fn upload_coarse(
+        &self,
+        device: &Device,
+        half: &Frame,
+        views: &[View],
+        levels: &[Level],
+    ) -> u64 {
+        device.upload(&self.half_frame, 0, bytemuck::bytes_of(half));
+        device.upload(&self.coarse_views, 0, bytemuck::cast_slice(views));
+        for (at, level) in (0..).step_by(LEVEL_STRIDE as usize).zip(levels) {
+            device.upload(&self.levels, at, bytemuck::bytes_of(level));
         }
-    }
-
-    fn buffers(device: &Device, pixels: u64) -> (wgpu::Buffer, wgpu::Buffer) {
-        let usage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
-        (
-            device.buffer("depth_arena", DEPTH_BYTES * pixels, usage),
-            device.buffer("record_arena", RECORD_BYTES * pixels, usage),
-        )
-    }
-
-    pub fn bytes(&self) -> u64 {
-        self.residency.pixels() * BYTES_PER_PIXEL
-    }
-
-    /// The place of a viewpoint, within buffers that have grown to hold it.
-    pub fn place(&mut self, device: &Device, viewpoint: &Viewpoint) -> Option<Place> {
-        let before = self.residency.capacity();
-        let pixels = viewpoint.mesh.depth_m.len() as u64;
-        let version = (viewpoint.updates, viewpoint.stamp_ns);
-        let place = self.residency.place(viewpoint.id, version, pixels);
-        if self.residency.capacity() > before {
-            let (depth, records) = Self::buffers(device, self.residency.capacity());
-            let mut encoder =
-                device
-                    .device
-                    .create_command_encoder(&wgpu::CommandEncoderDescriptor {
-                        label: Some("arenas grow"),
-                    });
-            encoder.copy_buffer_to_buffer(&self.depth, 0, &depth, 0, DEPTH_BYTES * before);
-            encoder.copy_buffer_to_buffer(&self.records, 0, &records, 0, RECORD_BYTES * before);
-            device.queue.submit([encoder.finish()]);
-            (self.depth, self.records) = (depth, records);
-        }
-        place
-    }
-
-    /// Which triangles of a pixel's quad exist goes into the two lowest bits of its depth, which moves it by less than
-    /// 4e-7 of itself. Returns how many bytes went up.
-    pub fn upload_mesh(&self, device: &Device, first: u64, mesh: &Mesh) -> u64 {
-        let width = mesh.intrinsics.width;
-        let mut words: Vec<u32> = mesh.depth_m.iter().map(|z| z.to_bits() & !3).collect();
-        let quads = mesh.cut.chunks_exact((width - 1).max(1));
-        for (words, quads) in words.chunks_exact_mut(width).zip(quads) {
-            for (word, quad) in words.iter_mut().zip(quads) {
-                *word |= u32::from(*quad);
-            }
-        }
-        device.upload(
-            &self.depth,
-            DEPTH_BYTES * first,
-            bytemuck::cast_slice(&words),
-        );
-        size_of_val(words.as_slice()) as u64
-    }
-
-    pub fn upload_records(&self, device: &Device, first: u64, records: &[Record]) -> u64 {
-        device.upload(
-            &self.records,
-            RECORD_BYTES * first,
-            bytemuck::cast_slice(records),
-        );
-        size_of_val(records) as u64
+        (size_of::<Frame>() + size_of_val(views) + size_of_val(levels)) as u64
     }
 }
 
@@ -168,9 +122,10 @@ pub struct RecallBuffers {
 }
 
 impl RecallBuffers {
-    pub fn new(device: &Device, frame: &Frame) -> Self {
+    /// With maps of so many views.
+    pub fn new(device: &Device, frame: &Frame, views: u32) -> Self {
         let pixels = frame.pixels();
-        let views = frame.view_count.max(1);
+        let views = views.max(1);
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
         let map = |label| device.buffer(label, 4 * pixels * u64::from(views), storage);
         let names = [
@@ -202,6 +157,8 @@ pub struct ScoreBuffers {
     pub posterior_records: wgpu::Buffer,
     pub block_means: wgpu::Buffer,
     pub block_medians: wgpu::Buffer,
+    pub pyramid: wgpu::Buffer,
+    pub partial_sums: wgpu::Buffer,
     /// What every frame reads: exposure, time stamps, evidence, and the posterior if it is learnt.
     pub report: wgpu::Buffer,
 }
@@ -209,6 +166,8 @@ pub struct ScoreBuffers {
 impl ScoreBuffers {
     pub fn new(device: &Device, frame: &Frame) -> Self {
         let pixels = frame.pixels();
+        let half = u64::from(frame.width / 2) * u64::from(frame.height / 2);
+        let groups = half.div_ceil(u64::from(REFINE_THREADS * REFINE_PIXELS));
         let storage = BufferUsages::STORAGE | BufferUsages::COPY_DST | BufferUsages::COPY_SRC;
         Self {
             image: device.buffer("image", 3 * pixels, storage),
@@ -216,6 +175,8 @@ impl ScoreBuffers {
             posterior_records: device.buffer("posterior_records", RECORD_BYTES * pixels, storage),
             block_means: device.buffer("block_means", 4 * frame.blocks(), storage),
             block_medians: device.buffer("block_medians", 4 * frame.blocks(), storage),
+            pyramid: device.buffer("pyramid", PYRAMID_BYTES * (half + half / 2), storage),
+            partial_sums: device.buffer("partial_sums", 4 * u64::from(SUMS) * groups, storage),
             report: device.buffer(
                 "report",
                 EXPOSURE_BYTES + STAMPS_BYTES + 4 * frame.blocks() + RECORD_BYTES * pixels,
@@ -225,11 +186,11 @@ impl ScoreBuffers {
     }
 }
 
-/// Whether a device can hold what an image needs.
-pub fn fits(device: &Device, frame: &Frame) -> bool {
+/// Whether a device can hold what an image needs, with maps of so many views.
+pub fn fits(device: &Device, frame: &Frame, views: u32) -> bool {
     let pixels = frame.pixels();
     let largest = (RECORD_BYTES * pixels + EXPOSURE_BYTES + STAMPS_BYTES + 4 * frame.blocks())
-        .max(4 * pixels * u64::from(frame.view_count));
+        .max(4 * pixels * u64::from(views));
     largest.next_multiple_of(16) <= device.buffer_max()
 }
 
@@ -240,10 +201,24 @@ pub struct Bound<'a> {
     pub arenas: &'a Arenas,
     pub recall: &'a RecallBuffers,
     pub score: Option<&'a ScoreBuffers>,
+    /// Of the pyramid.
+    pub level: usize,
 }
 
 impl<'a> Bound<'a> {
-    pub fn buffer(&self, slot: Slot) -> &'a wgpu::Buffer {
+    pub fn resource(&self, slot: Slot) -> wgpu::BindingResource<'a> {
+        let buffer = self.buffer(slot);
+        if slot == Slot::Level {
+            return wgpu::BindingResource::Buffer(wgpu::BufferBinding {
+                buffer,
+                offset: LEVEL_STRIDE * self.level as u64,
+                size: wgpu::BufferSize::new(size_of::<Level>() as u64),
+            });
+        }
+        buffer.as_entire_binding()
+    }
+
+    fn buffer(&self, slot: Slot) -> &'a wgpu::Buffer {
         let score = || self.score.expect("only a frame is scored");
         match slot {
             Slot::Frame => &self.shared.frame,
@@ -264,6 +239,14 @@ impl<'a> Bound<'a> {
             Slot::PosteriorRecords => &score().posterior_records,
             Slot::BlockMeans => &score().block_means,
             Slot::BlockMedians => &score().block_medians,
+            Slot::HalfFrame => &self.shared.half_frame,
+            Slot::CoarseViews => &self.shared.coarse_views,
+            Slot::CoarseDepthArena => &self.arenas.coarse_depth,
+            Slot::LevelArena => &self.arenas.coarse_levels,
+            Slot::Level => &self.shared.levels,
+            Slot::Pyramid => &score().pyramid,
+            Slot::PartialSums => &score().partial_sums,
+            Slot::Estimate => &self.shared.estimate,
         }
     }
 }

@@ -124,8 +124,13 @@ impl Device {
         }
     }
 
-    /// The start of a buffer, when everything that was submitted is done.
-    pub fn read(&self, buffer: &wgpu::Buffer, bytes: u64) -> Result<Vec<u8>, Lost> {
+    /// The start of a buffer, when what was submitted is done.
+    pub fn read(
+        &self,
+        buffer: &wgpu::Buffer,
+        bytes: u64,
+        after: wgpu::SubmissionIndex,
+    ) -> Result<Vec<u8>, Lost> {
         self.check()?;
         let (sender, receiver) = std::sync::mpsc::channel();
         buffer.map_async(wgpu::MapMode::Read, ..bytes, move |result| {
@@ -134,12 +139,13 @@ impl Device {
         });
         self.device
             .poll(wgpu::PollType::Wait {
-                submission_index: None,
+                submission_index: Some(after),
                 timeout: Some(PATIENCE),
             })
             .map_err(|error| self.lost(&error.to_string()))?;
         self.check()?;
-        match receiver.try_recv() {
+        // Another place's thread may be the one that calls back.
+        match receiver.recv_timeout(PATIENCE) {
             Ok(Ok(())) => {}
             Ok(Err(error)) => return Err(self.lost(&error.to_string())),
             Err(error) => return Err(self.lost(&error.to_string())),

@@ -1,18 +1,20 @@
 //! One device's work: viewpoints are brought, passes are recorded and submitted, the report is read. Whatever is here is
 //! lost with the device, and can be made again from the memory.
 
+use std::sync::Arc;
+
 use super::{
     Counters,
+    arenas::Arenas,
     buffers::{
-        Arenas, Bound, EXPOSURE_BYTES, PRIOR_BYTES, RECORD_BYTES, RecallBuffers, STAMPS_BYTES,
+        Bound, EXPOSURE_BYTES, PRIOR_BYTES, RECORD_BYTES, RecallBuffers, STAMPS_BYTES,
         ScoreBuffers, SharedBuffers, fits,
     },
+    card::Share,
     device::{Device, Lost},
     layout::{Exposure, Frame, Rules, View},
-    passes::{
-        BLOCK_MEANS, BLOCK_MEDIANS, EXPOSE, EXPOSE_PIXELS, GAIN, MERGE_VIEWS, PASSES,
-        PROJECT_DEPTH, PROJECT_TRIANGLE, Pass, SCORE_PIXELS,
-    },
+    passes::{BLOCK_MEANS, BLOCK_MEDIANS, EXPOSE, EXPOSE_PIXELS, GAIN, PASSES, SCORE_PIXELS},
+    recording::{Passes, pass_seconds},
     residency::Place,
 };
 use crate::{
@@ -23,7 +25,7 @@ use crate::{
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::Viewpoint,
+        viewpoint::{Mesh, Viewpoint},
     },
     stages::{
         attend::BlockMap,
@@ -63,18 +65,23 @@ pub struct Report {
 }
 
 pub struct State {
-    pub device: Device,
-    shared: SharedBuffers,
-    arenas: Arenas,
-    queries: Option<wgpu::QuerySet>,
+    pub device: Arc<Device>,
+    pub(super) shared: SharedBuffers,
+    pub(super) arenas: Arenas,
+    pub(super) queries: Option<wgpu::QuerySet>,
+    /// How many views are recalled as a rule.
+    views: u32,
     /// The last used at the end.
-    sizes: Vec<(RecallBuffers, ScoreBuffers)>,
+    pub(super) sizes: Vec<(RecallBuffers, ScoreBuffers)>,
     /// Whether the last of `sizes` holds the maps of the last frame.
     has_maps: bool,
+    /// Whether it holds the image of the next.
+    pub(super) has_image: bool,
 }
 
 impl State {
-    pub fn new(device: Device, rules: &Rules) -> Self {
+    /// `views` are recalled as a rule.
+    pub fn new(device: Arc<Device>, rules: &Rules, views: usize, share: Share) -> Self {
         let queries = device.timed.then(|| {
             device.device.create_query_set(&wgpu::QuerySetDescriptor {
                 label: Some("stamps"),
@@ -84,10 +91,12 @@ impl State {
         });
         Self {
             shared: SharedBuffers::new(&device, rules),
-            arenas: Arenas::new(&device),
+            arenas: Arenas::new(&device, share),
             queries,
+            views: views as u32,
             sizes: Vec::new(),
             has_maps: false,
+            has_image: false,
             device,
         }
     }
@@ -105,22 +114,24 @@ impl State {
         counters: &mut Counters,
     ) -> Result<Report, Failure> {
         let frame = Frame::new(intrinsics.width, intrinsics.height, views.len());
-        if !fits(&self.device, &frame) {
-            return Err(Failure::TooLarge);
-        }
-        self.has_maps = false;
-        let placed = self.bring(views, intrinsics, world_from_camera, counters)?;
-        self.take_size(&frame);
+        self.bring(views, counters)?;
+        self.take_image(&frame, image, counters)?;
+        self.has_image = false;
+        let placed = self.placed(
+            views,
+            |viewpoint| &viewpoint.mesh,
+            intrinsics,
+            world_from_camera,
+        );
         let (recall, buffers) = self.sizes.last().expect("the size was just taken");
         let bound = Bound {
             shared: &self.shared,
             arenas: &self.arenas,
             recall,
             score: Some(buffers),
+            level: 0,
         };
         counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed);
-        self.device.upload(&buffers.image, 0, &image.data);
-        counters.uploaded_bytes += image.data.len() as u64;
 
         let mut passes = Passes::new(&self.device, self.queries.as_ref(), "frame");
         passes.recall(bound, &frame, views);
@@ -160,25 +171,17 @@ impl State {
             bytes += records;
         }
         let run = passes.submit();
-        counters.passes += run.len() as u64;
-        let read = self.device.read(&buffers.report, bytes)?;
+        counters.passes += run.labels.len() as u64;
+        let read = self.device.read(&buffers.report, bytes, run.index)?;
         counters.read_back_bytes += bytes;
 
         let (head, posterior) = read.split_at(posterior_at as usize);
         let exposure: Exposure = bytemuck::pod_read_unaligned(&head[..size_of::<Exposure>()]);
         score.gain = exposure.gain;
         if self.queries.is_some() {
-            let stamps: Vec<u64> =
-                bytemuck::pod_collect_to_vec(&head[EXPOSURE_BYTES as usize..evidence_at as usize]);
-            let period_s = f64::from(self.device.queue.get_timestamp_period()) * 1e-9;
-            counters.pass_seconds = run
-                .iter()
-                .zip(stamps.chunks_exact(2))
-                .map(|(&pass, ends)| {
-                    let ticks = ends[1].saturating_sub(ends[0]);
-                    (PASSES[pass].label, ticks as f64 * period_s)
-                })
-                .collect();
+            let stamps = &head[EXPOSURE_BYTES as usize..evidence_at as usize];
+            let seconds = pass_seconds(&self.device, &run.labels, stamps);
+            counters.pass_seconds.extend(seconds);
         }
         let evidence = BlockMap {
             width: frame.blocks_wide as usize,
@@ -215,21 +218,28 @@ impl State {
         counters: &mut Counters,
     ) -> Result<(), Failure> {
         let frame = Frame::new(intrinsics.width, intrinsics.height, views.len());
-        if !fits(&self.device, &frame) {
+        if !fits(&self.device, &frame, frame.view_count) {
             return Err(Failure::TooLarge);
         }
-        let placed = self.bring(views, intrinsics, world_from_camera, counters)?;
-        let recall = RecallBuffers::new(&self.device, &frame);
+        self.bring(views, counters)?;
+        let placed = self.placed(
+            views,
+            |viewpoint| &viewpoint.mesh,
+            intrinsics,
+            world_from_camera,
+        );
+        let recall = RecallBuffers::new(&self.device, &frame, frame.view_count);
         let bound = Bound {
             shared: &self.shared,
             arenas: &self.arenas,
             recall: &recall,
             score: None,
+            level: 0,
         };
         counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed);
         let mut passes = Passes::new(&self.device, None, "recall");
         passes.recall(bound, &frame, views);
-        counters.passes += passes.submit().len() as u64;
+        counters.passes += passes.submit().labels.len() as u64;
         counters.read_back_bytes += 4 * PRIOR_BYTES * frame.pixels();
         self.read_prior(&recall, prior)?;
         Ok(())
@@ -250,8 +260,10 @@ impl State {
             0,
             RECORD_BYTES * pixels,
         );
-        passes.submit();
-        let records = self.device.read(&buffers.report, RECORD_BYTES * pixels)?;
+        let index = passes.submit().index;
+        let records = self
+            .device
+            .read(&buffers.report, RECORD_BYTES * pixels, index)?;
         score.posterior = bytemuck::pod_collect_to_vec(&records);
         Ok(())
     }
@@ -266,12 +278,11 @@ impl State {
         let Some((_, buffers)) = self.sizes.last().filter(is_last) else {
             return;
         };
-        self.arenas.residency.begin();
+        let evicted = self.arenas.residency.evicted();
+        self.arenas.begin(&self.device, std::iter::once(viewpoint));
         // Without room the next recall brings it.
         if let Some(Place::Empty(first)) = self.arenas.place(&self.device, viewpoint) {
-            counters.uploaded_bytes +=
-                self.arenas
-                    .upload_mesh(&self.device, first, &viewpoint.mesh);
+            counters.uploaded_bytes += self.arenas.upload_meshes(&self.device, first, viewpoint);
             let mut passes = Passes::new(&self.device, None, "remember");
             passes.copy(
                 &buffers.posterior_records,
@@ -282,6 +293,7 @@ impl State {
             passes.submit();
         }
         counters.resident_bytes = self.arenas.bytes();
+        counters.evicted += self.arenas.residency.evicted() - evicted;
     }
 
     /// Viewpoints changed elsewhere: the next recall brings what it needs.
@@ -289,87 +301,112 @@ impl State {
         self.arenas.residency.clear();
     }
 
-    /// Brings the views that are not there, and says where all of them are.
-    fn bring(
+    /// Brings the views that are not there.
+    pub(super) fn bring(
         &mut self,
         views: &[RecallView],
+        counters: &mut Counters,
+    ) -> Result<(), Failure> {
+        let evicted = self.arenas.residency.evicted();
+        if !self.bring_all(views, counters) {
+            // There may be room, but in pieces.
+            self.arenas.residency.clear();
+            if !self.bring_all(views, counters) {
+                return Err(Failure::TooLarge);
+            }
+        }
+        counters.resident_bytes = self.arenas.bytes();
+        counters.evicted += self.arenas.residency.evicted() - evicted;
+        Ok(())
+    }
+
+    fn bring_all(&mut self, views: &[RecallView], counters: &mut Counters) -> bool {
+        let viewpoints = || views.iter().map(|view| view.viewpoint);
+        self.arenas.begin(&self.device, viewpoints());
+        for viewpoint in viewpoints() {
+            let Some(place) = self.arenas.place(&self.device, viewpoint) else {
+                return false;
+            };
+            if let Place::Empty(first) = place {
+                counters.views_brought += 1;
+                counters.uploaded_bytes +=
+                    self.arenas.upload_meshes(&self.device, first, viewpoint)
+                        + self
+                            .arenas
+                            .upload_records(&self.device, first, &viewpoint.records);
+            }
+        }
+        true
+    }
+
+    /// The views that were brought, as a camera sees them.
+    pub(super) fn placed(
+        &self,
+        views: &[RecallView],
+        mesh: fn(&Viewpoint) -> &Mesh,
         intrinsics: &Intrinsics,
         world_from_camera: &Pose,
-        counters: &mut Counters,
-    ) -> Result<Vec<View>, Failure> {
-        let placed = match self.place_all(views, counters) {
-            Some(placed) => placed,
-            None => {
-                // There may be room, but in pieces.
-                self.arenas.residency.clear();
-                self.place_all(views, counters).ok_or(Failure::TooLarge)?
-            }
-        };
-        counters.resident_bytes = self.arenas.bytes();
-        counters.evicted = self.arenas.residency.evicted();
-        Ok(views
+    ) -> Vec<View> {
+        views
             .iter()
-            .zip(placed)
-            .map(|(view, first)| {
+            .map(|view| {
+                let first = self.arenas.residency.first(view.viewpoint.id);
                 View::new(
-                    view.viewpoint,
+                    mesh(view.viewpoint),
+                    &view.viewpoint.world_from_camera,
                     intrinsics,
                     world_from_camera,
-                    first as u32,
+                    first.expect("the views were brought") as u32,
                     view.weight,
                     view.fresh,
                 )
             })
-            .collect())
-    }
-
-    fn place_all(&mut self, views: &[RecallView], counters: &mut Counters) -> Option<Vec<u64>> {
-        self.arenas.residency.begin();
-        views
-            .iter()
-            .map(|view| {
-                Some(match self.arenas.place(&self.device, view.viewpoint)? {
-                    Place::Held(first) => first,
-                    Place::Empty(first) => {
-                        let viewpoint = view.viewpoint;
-                        counters.views_brought += 1;
-                        counters.uploaded_bytes +=
-                            self.arenas
-                                .upload_mesh(&self.device, first, &viewpoint.mesh)
-                                + self.arenas.upload_records(
-                                    &self.device,
-                                    first,
-                                    &viewpoint.records,
-                                );
-                        first
-                    }
-                })
-            })
             .collect()
     }
 
-    /// Puts the buffers of an image size at the end of `sizes`.
-    fn take_size(&mut self, frame: &Frame) {
-        let known = self.sizes.iter().position(|(recall, _)| {
+    /// Puts the buffers of an image's size at the end of `sizes`, with the image in them. The maps of the frame before
+    /// are gone then.
+    pub(super) fn take_image(
+        &mut self,
+        frame: &Frame,
+        image: &RgbImage,
+        counters: &mut Counters,
+    ) -> Result<(), Failure> {
+        let views = self.views.max(frame.view_count);
+        if !fits(&self.device, frame, views) {
+            return Err(Failure::TooLarge);
+        }
+        self.has_maps = false;
+        let is_same_size = |(recall, _): &(RecallBuffers, ScoreBuffers)| {
             (recall.width, recall.height) == (frame.width, frame.height)
-                && recall.views >= frame.view_count
-        });
+        };
+        if self.has_image && self.sizes.last().is_some_and(is_same_size) {
+            return Ok(());
+        }
+        let known = self
+            .sizes
+            .iter()
+            .position(|size| is_same_size(size) && size.0.views >= views);
         let buffers = match known {
             Some(index) => self.sizes.remove(index),
             None => {
-                self.sizes.retain(|(recall, _)| {
-                    (recall.width, recall.height) != (frame.width, frame.height)
-                });
+                self.sizes.retain(|size| !is_same_size(size));
                 if self.sizes.len() == SIZES_MAX {
                     self.sizes.remove(0);
                 }
                 (
-                    RecallBuffers::new(&self.device, frame),
+                    RecallBuffers::new(&self.device, frame, views),
                     ScoreBuffers::new(&self.device, frame),
                 )
             }
         };
+        self.device.upload(&buffers.1.image, 0, &image.data);
+        counters.uploaded_bytes += image.data.len() as u64;
+        // A new frame's.
+        counters.pass_seconds.clear();
         self.sizes.push(buffers);
+        self.has_image = true;
+        Ok(())
     }
 
     fn read_prior(&self, recall: &RecallBuffers, prior: &mut Prior) -> Result<(), Lost> {
@@ -379,8 +416,9 @@ impl State {
             let mut passes = Passes::new(&self.device, None, "prior plane");
             let bytes = PRIOR_BYTES * (width * height) as u64;
             passes.copy(buffer, &recall.plane, 0, bytes);
-            passes.submit();
-            *plane = bytemuck::pod_collect_to_vec(&self.device.read(&recall.plane, bytes)?);
+            let index = passes.submit().index;
+            let read = self.device.read(&recall.plane, bytes, index)?;
+            *plane = bytemuck::pod_collect_to_vec(&read);
         }
         prior.resize(width, height);
         let [spread, level, sigma, earlier] = &planes;
@@ -409,123 +447,11 @@ impl State {
         let (recall, _) = self.sizes.last().expect("a frame was compared");
         let mut passes = Passes::new(&self.device, None, "plane");
         passes.copy(buffer, &recall.plane, 0, bytes);
-        passes.submit();
-        Ok(bytemuck::pod_collect_to_vec(
-            &self.device.read(&recall.plane, bytes)?,
-        ))
-    }
-}
-
-/// A list of passes that is being recorded.
-struct Passes<'a> {
-    device: &'a Device,
-    encoder: wgpu::CommandEncoder,
-    queries: Option<&'a wgpu::QuerySet>,
-    run: Vec<usize>,
-}
-
-impl<'a> Passes<'a> {
-    fn new(device: &'a Device, queries: Option<&'a wgpu::QuerySet>, label: &str) -> Self {
-        let descriptor = wgpu::CommandEncoderDescriptor { label: Some(label) };
-        Self {
-            encoder: device.device.create_command_encoder(&descriptor),
-            device,
-            queries,
-            run: Vec::new(),
-        }
-    }
-
-    /// Project and merge.
-    fn recall(&mut self, bound: Bound, frame: &Frame, views: &[RecallView]) {
-        let map_bytes = 4 * frame.pixels() * views.len() as u64;
-        self.encoder
-            .clear_buffer(&bound.recall.nearest, 0, Some(map_bytes));
-        self.encoder
-            .clear_buffer(&bound.recall.triangles, 0, Some(map_bytes));
-        let quads = |side: fn(&Intrinsics) -> usize| {
-            let sides = views
-                .iter()
-                .map(|view| side(&view.viewpoint.mesh.intrinsics));
-            sides.max().unwrap_or(0).saturating_sub(1) as u64
-        };
-        let quads = [quads(|i| i.width), quads(|i| i.height), views.len() as u64];
-        self.run(PROJECT_DEPTH, bound, quads);
-        self.run(PROJECT_TRIANGLE, bound, quads);
-        let pixels = [u64::from(frame.width), u64::from(frame.height), 1];
-        self.run(MERGE_VIEWS, bound, pixels);
-    }
-
-    /// One pass over so many invocations.
-    fn run(&mut self, pass: usize, bound: Bound, invocations: [u64; 3]) {
-        if invocations.contains(&0) {
-            return;
-        }
-        let (
-            pipeline,
-            Pass {
-                label,
-                workgroup,
-                bindings,
-                ..
-            },
-        ) = (&self.device.pipelines[pass], &PASSES[pass]);
-        let entries: Vec<wgpu::BindGroupEntry> = bindings
-            .iter()
-            .map(|&(binding, slot)| wgpu::BindGroupEntry {
-                binding,
-                resource: bound.buffer(slot).as_entire_binding(),
-            })
-            .collect();
-        let group = self
-            .device
-            .device
-            .create_bind_group(&wgpu::BindGroupDescriptor {
-                label: Some(label),
-                layout: &pipeline.get_bind_group_layout(0),
-                entries: &entries,
-            });
-        let first = 2 * self.run.len() as u32;
-        let mut compute = self
-            .encoder
-            .begin_compute_pass(&wgpu::ComputePassDescriptor {
-                label: Some(label),
-                timestamp_writes: self
-                    .queries
-                    .map(|query_set| wgpu::ComputePassTimestampWrites {
-                        query_set,
-                        beginning_of_pass_write_index: Some(first),
-                        end_of_pass_write_index: Some(first + 1),
-                    }),
-            });
-        compute.set_pipeline(pipeline);
-        compute.set_bind_group(0, &group, &[]);
-        let groups = |axis: usize| invocations[axis].div_ceil(workgroup[axis].into()) as u32;
-        compute.dispatch_workgroups(groups(0), groups(1), groups(2));
-        drop(compute);
-        self.run.push(pass);
-    }
-
-    fn clear(&mut self, buffer: &wgpu::Buffer) {
-        self.encoder.clear_buffer(buffer, 0, None);
-    }
-
-    /// The whole of `from`, `bytes`, to a place in `to`.
-    fn copy(&mut self, from: &wgpu::Buffer, to: &wgpu::Buffer, at: u64, bytes: u64) {
-        self.encoder.copy_buffer_to_buffer(from, 0, to, at, bytes);
-    }
-
-    /// The time stamps of the passes so far.
-    fn resolve(&mut self, stamps: &wgpu::Buffer, to: &wgpu::Buffer, at: u64) {
-        if let Some(queries) = self.queries {
-            let count = 2 * self.run.len() as u32;
-            self.encoder.resolve_query_set(queries, 0..count, stamps, 0);
-            self.copy(stamps, to, at, STAMPS_BYTES);
-        }
-    }
-
-    /// Returns which passes were run.
-    fn submit(self) -> Vec<usize> {
-        self.device.queue.submit([self.encoder.finish()]);
-        self.run
+        let index = passes.submit().index;
+        Ok(bytemuck::pod_collect_to_vec(&self.device.read(
+            &recall.plane,
+            bytes,
+            index,
+        )?))
     }
 }

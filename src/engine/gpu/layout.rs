@@ -4,9 +4,17 @@ use bytemuck::{Pod, Zeroable};
 
 use crate::{
     config::{Settings, UnseenStart},
-    model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
+    model::{
+        camera::Intrinsics,
+        pose::{Pose, PoseNoise},
+        viewpoint::Mesh,
+    },
     stages::{
-        attend::BLOCK, interpolate::project::homography, surprise::GammaTerm, update::UpdateRules,
+        attend::BLOCK,
+        interpolate::project::homography,
+        refine::{LEVELS_MAX, discount, precision},
+        surprise::GammaTerm,
+        update::UpdateRules,
     },
 };
 
@@ -61,20 +69,17 @@ pub struct View {
 }
 
 impl View {
+    /// `mesh` is the viewpoint's, or its coarse one's.
     pub fn new(
-        viewpoint: &Viewpoint,
+        mesh: &Mesh,
+        world_from_view: &Pose,
         intrinsics: &Intrinsics,
         world_from_camera: &Pose,
         first: u32,
         weight: f32,
         fresh: bool,
     ) -> Self {
-        let (h_matrix, h_offset) = homography(
-            &viewpoint.mesh,
-            &viewpoint.world_from_camera,
-            intrinsics,
-            world_from_camera,
-        );
+        let (h_matrix, h_offset) = homography(mesh, world_from_view, intrinsics, world_from_camera);
         let row = |axis: usize| {
             [
                 h_matrix[(axis, 0)] as f32,
@@ -87,8 +92,8 @@ impl View {
             h_x: row(0),
             h_y: row(1),
             h_z: row(2),
-            width: viewpoint.mesh.intrinsics.width as u32,
-            height: viewpoint.mesh.intrinsics.height as u32,
+            width: mesh.intrinsics.width as u32,
+            height: mesh.intrinsics.height as u32,
             first,
             fresh: u32::from(fresh),
             weight,
@@ -163,4 +168,87 @@ pub struct Exposure {
     pub inverse_gain: f32,
     /// Pixels that some viewpoint saw.
     pub seen: u32,
+}
+
+/// A level of the pyramid that refinement looks at, and what holds for all of them. Level 0 is half the image.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub struct Level {
+    pub focal: [f32; 2],
+    pub center: [f32; 2],
+    /// Inverse variances of translation, rotation, gain and offset, as the noise of the pose says.
+    pub certainty: [[f32; 4]; 2],
+    pub width: u32,
+    pub height: u32,
+    /// Its first pixel in the pyramid.
+    pub first: u32,
+    pub index: u32,
+    /// Of the level before.
+    pub finer_width: u32,
+    pub finer_first: u32,
+    pub image_width: u32,
+    /// Correlated pixels count less.
+    pub inverse_discount: f32,
+    /// Of the image, pixels.
+    pub image_focal: f32,
+    pub position_sd_m: f32,
+    pub rotation_sd_rad: f32,
+    _padding: u32,
+}
+
+impl Level {
+    pub fn pixels(&self) -> u64 {
+        u64::from(self.width) * u64::from(self.height)
+    }
+
+    pub fn pyramid(intrinsics: &Intrinsics, noise: PoseNoise) -> [Self; LEVELS_MAX] {
+        let precision = precision(noise).map(|precision| precision as f32);
+        let mut camera = intrinsics.half();
+        let (mut first, mut finer_width, mut finer_first) = (0, 0, 0);
+        std::array::from_fn(|index| {
+            let level = Self {
+                focal: [camera.fx as f32, camera.fy as f32],
+                center: [camera.cx as f32, camera.cy as f32],
+                certainty: [
+                    std::array::from_fn(|axis| precision[axis]),
+                    std::array::from_fn(|axis| precision[4 + axis]),
+                ],
+                width: camera.width as u32,
+                height: camera.height as u32,
+                first,
+                index: index as u32,
+                finer_width,
+                finer_first,
+                image_width: intrinsics.width as u32,
+                inverse_discount: (1.0 / discount(intrinsics.pixels(), index)) as f32,
+                image_focal: intrinsics.fx as f32,
+                position_sd_m: noise.position_m as f32,
+                rotation_sd_rad: noise.rotation_rad as f32,
+                _padding: 0,
+            };
+            (finer_width, finer_first) = (level.width, first);
+            first += level.pixels() as u32;
+            camera = camera.half();
+            level
+        })
+    }
+}
+
+/// What refinement has found so far: the real camera is `given * given_from_real`, and Y = gain * tau + offset.
+#[derive(Debug, Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub struct Estimate {
+    /// Of `given_from_real`, a unit quaternion, its real part last.
+    pub rotation: [f32; 4],
+    pub translation: [f32; 3],
+    pub gain: f32,
+    /// Sum of the capped residuals and their number: at the last look, and at the one before.
+    pub mismatch: [f32; 2],
+    pub mismatch_before: [f32; 2],
+    pub offset: f32,
+    /// 0 where too little is predicted.
+    pub level_count: u32,
+    /// Comparable pixels of the finest level.
+    pub point_count: u32,
+    _padding: u32,
 }

@@ -1,17 +1,27 @@
-//! The engine on a graphics card: the stages in WGSL (`shaders/`), a twin for each, in one list of passes a frame.
+//! The engine on a graphics card: the stages in WGSL (`shaders/`), a twin for each, in two lists of passes a frame.
 //!
 //! Viewpoints stay on the device while there is room; the posterior becomes a viewpoint there without a journey. The
-//! processor keeps every viewpoint too, so a lost device loses nothing that was reported. One frame is in flight: its
-//! report is awaited, because the next frame's prior depends on what is learnt.
+//! processor keeps every viewpoint too, so a lost device loses nothing that was reported. One frame of a place is in
+//! flight: its report is awaited, because the next frame's prior depends on what is learnt. The device and its pipelines
+//! are those of all places.
 //!
-//! Passes a frame: project depth, project triangle, merge, expose, gain, score, block means, and block medians where the
-//! evidence is their median: 8, whatever the number of views. Bytes a frame of P pixels, V views of P pixels:
+//! Two read-backs a frame: the refined pose is awaited before the comparison is recorded, because the views of the
+//! comparison are chosen by it from the whole memory, and those that are not resident are brought. The image goes up
+//! once.
+//!
+//! Passes a frame, whatever the number of views: 13. Refinement has 5: project coarse depth, project coarse triangle,
+//! expect, halve (3 dispatches) and refine (54: depths and begin, twice accumulate and judge, and magnitudes, accumulate
+//! and step four times on each of four levels; coarse ones that the pose's noise does not call for do nothing). The
+//! comparison has 8: project depth, project triangle, merge, expose, gain, score, block means, and block medians where
+//! the evidence is their median. Bytes a frame of P pixels, V views of P pixels:
 //!
 //! | over the bus | bytes | 320x240 |
 //! |---|---|---|
-//! | up: image, and depth of what is learnt | 3 P + 4 P | 0.54 MB |
-//! | up: a view that is not resident | 36 P | 2.76 MB |
-//! | down: evidence, exposure, time stamps | P / 4 + 144 | 19 kB |
+//! | up: image; depth, coarse depth and luminance of what is learnt | 3 P + 7 P | 0.77 MB |
+//! | up: a view that is not resident | 39 P | 3.0 MB |
+//! | up: poses, sizes, levels | < 3 kB | 3 kB |
+//! | down: refined pose, its time stamps | 352 | 0.4 kB |
+//! | down: evidence, exposure, time stamps | P / 4 + 304 | 20 kB |
 //! | down, if it is learnt: the posterior | 32 P | 2.46 MB |
 //! | down, if something surprises: the map | 4 P | 0.31 MB |
 //! | down, if somebody wants the maps | 100 P | 7.7 MB |
@@ -22,11 +32,19 @@
 //! | gather: each record once, if neighbours share the cache | 32 V P |
 //! | the prior written, then read by expose (32 B) and score (64 B, neighbours from the cache) | 160 P |
 //! | image read twice, surprise and posterior written, surprise read, posterior copied | 110 P |
+//! | refinement: the maps of three views of P / 4 pixels, luminance and variance gathered | 33 P |
+//! | the image read, the pyramid written, read by halve and depths | 18 P |
+//! | the pyramid read twice a step, neighbours from the cache: 16 B, 4 steps, P / 3 pixels, and by the judges | 51 P |
 //!
-//! A model, not a measurement: with V = 7 that is 746 P, 57 MB at 320x240 and 229 MB at 640x480. A card of 400 GB/s that
-//! reaches half of it needs 0.3 ms and 1.2 ms; a bus of 12 GB/s adds 0.25 ms and 1.0 ms where everything is learnt.
+//! A model, not a measurement: with V = 7 that is 848 P, 65 MB at 320x240 and 260 MB at 640x480. A card of 400 GB/s that
+//! reaches half of it needs 0.3 ms and 1.3 ms, and 0.3 ms beside if each of the 68 dispatches waits 5 us for the one
+//! before; a bus of 12 GB/s adds 0.27 ms and 1.1 ms where everything is learnt.
+
+mod arenas;
 
 mod buffers;
+
+pub mod card;
 
 mod device;
 
@@ -36,6 +54,10 @@ pub mod layout;
 
 pub mod passes;
 
+mod recording;
+
+mod refine;
+
 pub mod residency;
 
 use std::sync::Arc;
@@ -43,19 +65,27 @@ use std::sync::Arc;
 use rayon::ThreadPool;
 
 use self::{
-    device::{Adapters, Device},
+    card::Card,
     frame::{Failure, State, Wanted},
     layout::Rules,
 };
 use super::{
     Answer, Compared, EngineError, Question, compare_on_processor,
     cpu::{CpuEngine, RecallView, Score},
+    refine_on_processor,
 };
 use crate::{
     config::Settings,
     isa::Isa,
-    model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
-    stages::interpolate::prior::Prior,
+    model::{
+        camera::Intrinsics,
+        pose::{Pose, PoseNoise},
+        viewpoint::Viewpoint,
+    },
+    stages::{
+        interpolate::prior::Prior,
+        refine::{PoseRefiner, Refined},
+    },
 };
 
 /// What was moved and done, since the engine was made.
@@ -81,7 +111,7 @@ pub struct Counters {
 pub struct GpuEngine {
     settings: Settings,
     rules: Rules,
-    adapters: Adapters,
+    card: Arc<Card>,
     state: State,
     /// For what does not fit the device.
     processor: CpuEngine,
@@ -91,30 +121,23 @@ pub struct GpuEngine {
 }
 
 impl GpuEngine {
-    /// # Errors
-    /// No adapter, or one that gives no device.
     pub(super) fn new(
-        software_too: bool,
+        card: &Arc<Card>,
         settings: &Settings,
         pool: Arc<ThreadPool>,
         isa: Isa,
-    ) -> Result<Self, EngineError> {
-        let adapters = if software_too {
-            Adapters::Any
-        } else {
-            Adapters::Real
-        };
+    ) -> Self {
         let rules = Rules::new(settings);
-        Ok(Self {
+        Self {
+            state: State::new(card.device(), &rules, settings.views, card.share()),
             settings: settings.clone(),
-            adapters,
-            state: open(adapters, &rules)?,
+            card: Arc::clone(card),
             rules,
             processor: CpuEngine::new(settings, Arc::clone(&pool), isa),
             pool,
             isa,
             counters: Counters::default(),
-        })
+        }
     }
 
     /// Name and kind of the adapter.
@@ -128,7 +151,7 @@ impl GpuEngine {
 
     /// Whether another engine should take over when the device cannot be replaced.
     pub(super) fn falls_back(&self) -> bool {
-        self.adapters == Adapters::Real
+        self.card.falls_back()
     }
 
     pub(super) fn processor(&self) -> &CpuEngine {
@@ -140,9 +163,27 @@ impl GpuEngine {
         CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
     }
 
-    /// Gives the device up, as when a driver fails: the next call finds it lost.
-    pub fn destroy_device(&self) {
-        self.state.device.device.destroy();
+    /// The pose of a frame that is compared next, from its nearest views. `refiner` is for what does not fit the device.
+    pub(super) fn refine(
+        &mut self,
+        question: &Question,
+        noise: PoseNoise,
+        refiner: &mut PoseRefiner,
+    ) -> Result<Refined, EngineError> {
+        let refined = self.persevere(|state, counters| {
+            state.refine(
+                question.views,
+                question.intrinsics,
+                question.world_from_camera,
+                question.image,
+                noise,
+                counters,
+            )
+        })?;
+        Ok(refined.unwrap_or_else(|| {
+            self.counters.on_processor += 1;
+            refine_on_processor(&self.processor, question, noise, refiner)
+        }))
     }
 
     pub(super) fn compare(
@@ -236,19 +277,13 @@ impl GpuEngine {
             reason = lost.0,
             "the device was lost; opening another"
         );
-        self.state = open(self.adapters, &self.rules).map_err(|_| EngineError::Lost(lost.0))?;
+        let device = self.card.replace(&self.state.device);
+        let device = device.map_err(|_| EngineError::Lost(lost.0))?;
+        self.state = State::new(device, &self.rules, self.settings.views, self.card.share());
         match attempt(&mut self.state, &mut self.counters) {
             Ok(done) => Ok(Some(done)),
             Err(Failure::TooLarge) => Ok(None),
             Err(Failure::Lost(lost)) => Err(EngineError::Lost(lost.0)),
         }
-    }
-}
-
-fn open(adapters: Adapters, rules: &Rules) -> Result<State, EngineError> {
-    match Device::open(adapters) {
-        Ok(Some(device)) => Ok(State::new(device, rules)),
-        Ok(None) => Err(EngineError::NoAdapter),
-        Err(lost) => Err(EngineError::Lost(lost.0)),
     }
 }

@@ -22,6 +22,17 @@ pub enum Slot {
     PosteriorRecords,
     BlockMeans,
     BlockMedians,
+    /// As [`Self::Frame`], of half the image.
+    HalfFrame,
+    /// As [`Self::Views`], of the viewpoints at half resolution.
+    CoarseViews,
+    CoarseDepthArena,
+    LevelArena,
+    /// Of the pass's own level.
+    Level,
+    Pyramid,
+    PartialSums,
+    Estimate,
 }
 
 impl Slot {
@@ -45,6 +56,14 @@ impl Slot {
             Self::PosteriorRecords => "posterior_records",
             Self::BlockMeans => "block_means",
             Self::BlockMedians => "block_medians",
+            Self::HalfFrame => "frame",
+            Self::CoarseViews => "views",
+            Self::CoarseDepthArena => "depth_arena",
+            Self::LevelArena => "level_arena",
+            Self::Level => "level",
+            Self::Pyramid => "pyramid",
+            Self::PartialSums => "partial_sums",
+            Self::Estimate => "estimate",
         }
     }
 }
@@ -67,6 +86,16 @@ macro_rules! shader {
 }
 
 const PROJECT: &str = shader!("layout.wgsl", "project.wgsl", "passes/project.wgsl");
+const PREDICT: &str = shader!(
+    "layout.wgsl",
+    "belief.wgsl",
+    "image.wgsl",
+    "project.wgsl",
+    "refine.wgsl",
+    "passes/predict.wgsl"
+);
+const COMPARE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/compare.wgsl");
+const SOLVE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/solve.wgsl");
 const MERGE: &str = shader!(
     "layout.wgsl",
     "belief.wgsl",
@@ -101,6 +130,21 @@ const DRAWN: &[(u32, Slot)] = &[
     (5, Slot::Triangles),
 ];
 
+const DRAWN_COARSE: &[(u32, Slot)] = &[
+    (0, Slot::HalfFrame),
+    (2, Slot::CoarseViews),
+    (3, Slot::CoarseDepthArena),
+    (4, Slot::Nearest),
+    (5, Slot::Triangles),
+];
+
+const SOLVED: &[(u32, Slot)] = &[
+    (0, Slot::Level),
+    (1, Slot::Estimate),
+    (2, Slot::Histogram),
+    (3, Slot::PartialSums),
+];
+
 /// One invocation a quad and view.
 pub const PROJECT_DEPTH: usize = 0;
 pub const PROJECT_TRIANGLE: usize = 1;
@@ -115,14 +159,34 @@ pub const SCORE_PIXELS: usize = 5;
 /// One a block.
 pub const BLOCK_MEANS: usize = 6;
 pub const BLOCK_MEDIANS: usize = 7;
+/// One a quad and view, at half resolution.
+pub const PROJECT_COARSE_DEPTH: usize = 8;
+pub const PROJECT_COARSE_TRIANGLE: usize = 9;
+/// One a pixel of a level.
+pub const EXPECT: usize = 10;
+pub const HALVE: usize = 11;
+/// One for [`REFINE_PIXELS`] pixels of a level.
+pub const DEPTHS: usize = 12;
+pub const MAGNITUDES: usize = 13;
+pub const ACCUMULATE: usize = 14;
+/// One workgroup.
+pub const BEGIN: usize = 15;
+pub const STEP: usize = 16;
+pub const JUDGE: usize = 17;
 
 /// Pixels of one invocation of [`EXPOSE`].
 pub const EXPOSE_PIXELS: u32 = 32;
+/// Pixels of one invocation of [`DEPTHS`], [`MAGNITUDES`] and [`ACCUMULATE`].
+pub const REFINE_PIXELS: u32 = 16;
+/// Invocations of their workgroups.
+pub const REFINE_THREADS: u32 = 64;
+/// What [`ACCUMULATE`] adds up.
+pub const SUMS: u32 = 47;
 /// Bins of the histogram, and the count of the seen pixels.
 pub const HISTOGRAM_WORDS: u64 = 2048 + 1;
 
-/// In the order of a frame's way.
-pub const PASSES: [Pass; 8] = [
+/// What compares a frame, in its order, and then what refines its pose before that.
+pub const PASSES: [Pass; 18] = [
     Pass {
         label: "project depth",
         source: PROJECT,
@@ -215,5 +279,96 @@ pub const PASSES: [Pass; 8] = [
             (2, Slot::BlockMeans),
             (3, Slot::BlockMedians),
         ],
+    },
+    Pass {
+        label: "project coarse depth",
+        source: PROJECT,
+        entry: "project_depth",
+        workgroup: [8, 8, 1],
+        bindings: DRAWN_COARSE,
+    },
+    Pass {
+        label: "project coarse triangle",
+        source: PROJECT,
+        entry: "project_triangle",
+        workgroup: [8, 8, 1],
+        bindings: DRAWN_COARSE,
+    },
+    Pass {
+        label: "expect",
+        source: PREDICT,
+        entry: "expect",
+        workgroup: [8, 8, 1],
+        bindings: &[
+            (0, Slot::HalfFrame),
+            (1, Slot::CoarseViews),
+            (2, Slot::Level),
+            (3, Slot::CoarseDepthArena),
+            (4, Slot::LevelArena),
+            (5, Slot::Nearest),
+            (6, Slot::Triangles),
+            (7, Slot::Image),
+            (8, Slot::Pyramid),
+        ],
+    },
+    Pass {
+        label: "halve",
+        source: PREDICT,
+        entry: "halve",
+        workgroup: [8, 8, 1],
+        bindings: &[(2, Slot::Level), (8, Slot::Pyramid)],
+    },
+    Pass {
+        label: "depths",
+        source: COMPARE,
+        entry: "depths",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: &[(0, Slot::Level), (2, Slot::Pyramid), (3, Slot::Histogram)],
+    },
+    Pass {
+        label: "magnitudes",
+        source: COMPARE,
+        entry: "magnitudes",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: &[
+            (0, Slot::Level),
+            (1, Slot::Estimate),
+            (2, Slot::Pyramid),
+            (3, Slot::Histogram),
+        ],
+    },
+    Pass {
+        label: "accumulate",
+        source: COMPARE,
+        entry: "accumulate",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: &[
+            (0, Slot::Level),
+            (1, Slot::Estimate),
+            (2, Slot::Pyramid),
+            (3, Slot::Histogram),
+            (4, Slot::PartialSums),
+        ],
+    },
+    Pass {
+        label: "begin",
+        source: SOLVE,
+        entry: "begin",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: &[(0, Slot::Level), (1, Slot::Estimate), (2, Slot::Histogram)],
+    },
+    Pass {
+        label: "step",
+        source: SOLVE,
+        entry: "step",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: SOLVED,
+    },
+    Pass {
+        label: "judge",
+        source: SOLVE,
+        entry: "judge",
+        workgroup: [REFINE_THREADS, 1, 1],
+        bindings: SOLVED,
     },
 ];

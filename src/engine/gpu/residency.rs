@@ -1,8 +1,10 @@
 //! Which viewpoints lie in the arenas, and where: the least recently used make room. Counted in pixels; the arenas hold
 //! [`BYTES_PER_PIXEL`] of each.
 
-/// Depth and record.
-pub const BYTES_PER_PIXEL: u64 = 4 + 32;
+/// Of the viewpoint in a coarse one.
+pub const COARSE_PIXELS: u64 = 4;
+/// Depth and record; coarse depth, luminance and variance.
+pub const BYTES_PER_PIXEL: u64 = 4 + 32 + (4 + 8) / COARSE_PIXELS;
 
 /// What tells a viewpoint from what it was before or, in a memory that began anew, from another of its name: how often
 /// it was updated, and when it was written.
@@ -52,10 +54,6 @@ impl Residency {
         self.capacity
     }
 
-    pub fn capacity_max(&self) -> u64 {
-        self.capacity_max
-    }
-
     /// Pixels of the viewpoints that are there.
     pub fn pixels(&self) -> u64 {
         self.held.iter().map(|held| held.pixels).sum()
@@ -65,9 +63,22 @@ impl Residency {
         self.evicted
     }
 
-    /// Begins a recall: what is placed from here on stays until the next one begins.
-    pub fn begin(&mut self) {
+    /// Where a viewpoint lies.
+    pub fn first(&self, id: u64) -> Option<u64> {
+        let held = self.held.iter().find(|held| held.id == id);
+        held.map(|held| held.first)
+    }
+
+    /// Begins a recall: what is placed from here on stays until the next one begins. Where the bound has fallen below
+    /// what there is, everything makes room.
+    pub fn begin(&mut self, capacity_max: u64) {
         self.recall += 1;
+        self.capacity_max = capacity_max;
+        if self.capacity > capacity_max {
+            self.capacity = capacity_max;
+            self.evicted += self.held.len() as u64;
+            self.held.clear();
+        }
     }
 
     /// Forgets everything.

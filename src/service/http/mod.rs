@@ -305,6 +305,11 @@ async fn readyz(State(app): State<App>) -> Response {
             missing.push(format!("the stored memory of {name} ({trouble})"));
         }
     }
+    let card = app.parts.places.engines.card();
+    // Where the processor has taken over there is nothing to wait for.
+    if card.is_some_and(|card| card.is_awaited()) {
+        missing.push("graphics card".to_owned());
+    }
     if missing.is_empty() {
         "ready\n".into_response()
     } else {
