@@ -226,6 +226,7 @@ impl<'a> Projector<'a> {
         // The row and columns that `lower` holds.
         let mut held = (usize::MAX, 0..0);
         let mut next = None;
+        let (mut block, mut batch) = (Block::NONE, Batch::NONE);
         for row in 0..self.reach.rows.len() {
             let touched = match next.take() {
                 Some(touched) => touched,
@@ -259,7 +260,7 @@ impl<'a> Projector<'a> {
                 cut,
             };
             for column in touched.step_by(LANES) {
-                quads.draw_block(column, &mut target);
+                quads.draw_block(column, &mut target, &mut block, &mut batch);
             }
         }
     }
@@ -410,7 +411,7 @@ impl QuadRow<'_> {
     /// The sixteen quads from `column` on, side by side: every candidate pixel of every quad's bounding box is tested
     /// against the triangle on its side of the diagonal.
     #[inline(always)]
-    fn draw_block(&self, column: usize, target: &mut Target) {
+    fn draw_block(&self, column: usize, target: &mut Target, block: &mut Block, batch: &mut Batch) {
         let mut triangles = [0u8; LANES];
         match self.cut[column..].first_chunk::<LANES>() {
             Some(quads) => triangles = *quads,
@@ -429,7 +430,6 @@ impl QuadRow<'_> {
             y: four_corners(&upper.y, &lower.y, column),
             inverse_depth: four_corners(&upper.inverse_depth, &lower.inverse_depth, column),
         };
-        let mut block = Block::NONE;
         block.bound(&corners, &triangles, target);
         let mut x_steps = 0;
         let mut y_steps = 0;
@@ -455,15 +455,17 @@ impl QuadRow<'_> {
         }
         block.prepare(&corners, &triangles, column, self.row);
         let steps = x_steps * y_steps;
+        let (mut x_step, mut y_step) = (0, 0);
         for first in (0..steps).step_by(BATCH) {
             // The hits of up to four candidates are written together: the end of the loop over them is hard to foresee.
-            let mut batch = Batch::NONE;
             let mut hits = 0u64;
-            for slot in 0..BATCH.min((steps - first) as usize) as i32 {
-                let step = first + slot;
-                let (x_step, y_step) = (step % x_steps, step / x_steps);
-                let found = block.sample(x_step, y_step, target, &mut batch, slot as usize);
-                hits |= u64::from(found) << (slot as usize * LANES);
+            for slot in 0..BATCH.min((steps - first) as usize) {
+                let found = block.sample(x_step, y_step, target, batch, slot);
+                hits |= u64::from(found) << (slot * LANES);
+                x_step += 1;
+                if x_step == x_steps {
+                    (x_step, y_step) = (0, y_step + 1);
+                }
             }
             while hits != 0 {
                 let hit = hits.trailing_zeros() as usize;
