@@ -201,11 +201,11 @@ impl Pipeline {
         let work = &mut self.workspace;
         let mut mesh = std::mem::take(&mut work.mesh);
         let mut coarse = std::mem::take(&mut work.coarse);
-        let mut records = std::mem::take(&mut work.records);
+        // The next posterior is written where records were that nobody needs.
+        let spare = std::mem::take(&mut work.records);
+        let records = std::mem::replace(&mut self.maps.score.posterior, spare);
         mesh.intrinsics = frame.intrinsics;
         std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
-        records.clear();
-        records.extend_from_slice(&self.maps.score.posterior);
         self.engine
             .prepare(&mut mesh, &records, &mut coarse, work.cut);
         let viewpoint = Viewpoint {

@@ -20,7 +20,7 @@ use crate::{
     },
     stages::{
         attend::BlockMap,
-        interpolate::prior::{self, Prior},
+        interpolate::prior::Prior,
     },
 };
 
@@ -219,19 +219,17 @@ fn compare_on_processor(
         evidence: found,
         blocks,
     } = answer;
-    engine.recall(
+    let seen = engine.compare(
         question.views,
         question.intrinsics,
         question.world_from_camera,
+        question.observation,
         prior,
+        score,
     );
-    engine.score(prior, question.observation, score);
     found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {
-        seen: prior
-            .plane(prior::COVERAGE)
-            .filter(|&count| count > 0.0)
-            .count(),
+        seen,
         maps_read: true,
     }
 }

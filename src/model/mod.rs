@@ -6,6 +6,8 @@ pub mod camera;
 
 pub mod frame;
 
+pub mod patch;
+
 pub mod pose;
 
 pub mod refusal;

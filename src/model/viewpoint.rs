@@ -6,6 +6,7 @@ use super::{
     belief::{LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
     camera::Intrinsics,
     frame::Source,
+    patch::{self, Patch},
     pose::Pose,
 };
 
@@ -53,6 +54,8 @@ pub struct Mesh {
     /// any.
     pub block_nearest_m: Vec<f32>,
     pub block_farthest_m: Vec<f32>,
+    /// The flat parts; no two share a quad.
+    pub patches: Vec<Patch>,
 }
 
 impl Mesh {
@@ -81,6 +84,7 @@ impl Mesh {
             plane.clear();
             plane.resize(blocks * height, 0.0);
         }
+        self.patches.clear();
         // Half of a camera one pixel wide has no column.
         if blocks == 0 {
             return;
@@ -117,6 +121,7 @@ impl Mesh {
                 farthest_m[block] = far;
             }
         }
+        patch::find(&self.depth_m, &self.cut, width, &mut self.patches);
     }
 
     /// Blocks of sixteen quads in a row.
@@ -129,6 +134,7 @@ impl Mesh {
             + size_of_val(self.cut.as_slice())
             + size_of_val(self.block_nearest_m.as_slice())
             + size_of_val(self.block_farthest_m.as_slice())
+            + self.patches.capacity() * size_of::<Patch>()
     }
 }
 

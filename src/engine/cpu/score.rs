@@ -7,7 +7,7 @@ use crate::{
     lanes::{LANES, Lanes, bits, members, prefetch},
     model::belief::{Belief, BeliefLanes, CHANNELS, Record},
     stages::{
-        interpolate::prior::{self, Prior, PriorRow},
+        interpolate::prior::{self, PriorRow},
         surprise::{GammaTerm, P2_MIN, edge_gradient_row, joint_surprise, plain_terms, total},
         update::UpdateRules,
     },
@@ -28,6 +28,13 @@ pub struct ScoreRules {
     pub surprise_threshold: f32,
 }
 
+impl ScoreRules {
+    /// Whether a pixel's score depends on those around it.
+    pub fn looks_around(&self) -> bool {
+        self.edge_variance_px > 0.0
+    }
+}
+
 /// Working memory of one thread.
 #[derive(Default)]
 pub struct ScoreScratch {
@@ -35,37 +42,39 @@ pub struct ScoreScratch {
 }
 
 for_each_isa! {
-    /// Row `y` of the image: surprise in nats and the posterior's records.
+    /// A row of the image, between its neighbours: surprise in nats and the posterior's records. Adds to `seen` how many
+    /// pixels some view saw.
     pub fn score_row(
-        prior: &Prior,
-        y: usize,
+        above: Option<PriorRow<'_>>,
+        row: PriorRow<'_>,
+        below: Option<PriorRow<'_>>,
         observed: [&[f32]; CHANNELS],
         inverse_gain: f32,
         rules: &ScoreRules,
         scratch: &mut ScoreScratch,
         surprise: &mut [f32],
         posterior: &mut [Record],
+        seen: &mut usize,
     ) = score_row_kernel;
 }
 
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
 fn score_row_kernel(
-    prior: &Prior,
-    y: usize,
+    above: Option<PriorRow>,
+    row: PriorRow,
+    below: Option<PriorRow>,
     observed: [&[f32]; CHANNELS],
     inverse_gain: f32,
     rules: &ScoreRules,
     scratch: &mut ScoreScratch,
     surprise: &mut [f32],
     posterior: &mut [Record],
+    seen: &mut usize,
 ) {
-    let width = prior.width;
-    let row = prior.row(y);
-    let widened = rules.edge_variance_px > 0.0;
+    let width = row.width;
+    let widened = rules.looks_around();
     if widened {
-        let above = y.checked_sub(1).map(|y| prior.row(y));
-        let below = (y + 1 < prior.height).then(|| prior.row(y + 1));
         let around = |plane: usize| {
             (
                 above.map(|row| row.plane(plane)),
@@ -105,6 +114,8 @@ fn score_row_kernel(
             }
         }
         surprise.copy_from_slice(&scored.surprise[..count]);
+        let covered = bits(|lane| (lane < count) & (step.coverage[lane] > 0.0));
+        *seen += covered.count_ones() as usize;
         for lane in members(two).take_while(|&lane| lane < count) {
             (surprise[lane], posterior[lane]) =
                 two_appearances(&step, &scored, lane, row.belief(start + lane), rules);

@@ -11,9 +11,12 @@ use crate::isa::for_each_isa;
 use crate::lanes::{LANES, Lanes, reciprocal};
 use crate::model::{
     camera::Intrinsics,
+    patch::PATCH_ROWS,
     pose::Pose,
     viewpoint::{LOWER_RIGHT, Mesh, UPPER_LEFT},
 };
+
+use super::patch::{Drawable, FlatPatch};
 
 /// A pixel of the map: `inverse depth (24 bit) | v (20 bit) | u (20 bit)`; 0 = the viewpoint does not see it.
 pub type Sample = u64;
@@ -25,13 +28,18 @@ pub const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
 /// The largest width and height that u and v can address.
 pub const SIDE_MAX: usize = 1 << (POSITION_BITS - 7);
 /// Of a positive `f32` the sign is 0 and 7 bits of the mantissa are left out: depth to 1.5e-5 of itself.
-const INVERSE_DEPTH_SHIFT: u32 = 7;
+pub const INVERSE_DEPTH_SHIFT: u32 = 7;
 /// Surfaces nearer than this to the target camera are dropped, metres: their projection blows up.
-const NEAR_M: f32 = 0.02;
+pub const NEAR_M: f32 = 0.02;
 
 /// 2^23: adding it leaves a non-negative number's nearest integer in the mantissa.
-const INTEGER: f32 = 8_388_608.0;
-const INTEGER_MASK: u32 = (1 << 23) - 1;
+pub const INTEGER: f32 = 8_388_608.0;
+pub const INTEGER_MASK: u32 = (1 << 23) - 1;
+
+/// Samples of the map of a strip of so many pixels: steps of sixteen may reach beyond the last.
+pub fn map_size(pixels: usize) -> usize {
+    pixels + LANES
+}
 
 #[inline(always)]
 fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
@@ -87,6 +95,10 @@ pub struct Reach {
     high: Vec<f32>,
     /// Of each row's blocks together.
     rows: Vec<(f32, f32)>,
+    /// The patches that are drawn as such.
+    flat: Vec<FlatPatch>,
+    /// Blocks of [`PATCH_ROWS`] rows that need no triangles.
+    done: Vec<bool>,
 }
 
 /// One row of projected vertices.
@@ -126,6 +138,25 @@ pub fn homography(
 }
 
 impl Reach {
+    /// Finds which patches are drawn as such.
+    fn flatten(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
+        let blocks = mesh.blocks();
+        self.flat.clear();
+        self.flat.reserve(mesh.patches.capacity());
+        self.done.clear();
+        self.done
+            .resize(blocks * mesh.intrinsics.height.div_ceil(PATCH_ROWS), false);
+        for patch in &mesh.patches {
+            match FlatPatch::new(patch, &mesh.intrinsics, h_matrix, h_offset) {
+                Drawable::ByTriangles => continue,
+                Drawable::Hidden => {}
+                Drawable::Flat(flat) => self.flat.push(flat),
+            }
+            let first = patch.row / PATCH_ROWS * blocks + patch.column / LANES;
+            self.done[first..first + patch.columns.div_ceil(LANES)].fill(true);
+        }
+    }
+
     /// Target y is monotonous in column and in depth, so the corners of a block's ranges bound it.
     fn compute(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
         let Intrinsics { width, height, .. } = mesh.intrinsics;
@@ -144,7 +175,12 @@ impl Reach {
             let farthest = &mesh.block_farthest_m[range.clone()];
             let lows = &mut self.low[range.clone()];
             let highs = &mut self.high[range];
+            let [above, below] = [row.saturating_sub(1), row.min(height.saturating_sub(2))]
+                .map(|quads| &self.done[quads / PATCH_ROWS * blocks..][..blocks]);
             for block in 0..blocks {
+                if above[block] & below[block] {
+                    continue;
+                }
                 let (mut low, mut high, mut least_z) =
                     (f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY);
                 let first = (block * LANES) as f32;
@@ -181,9 +217,12 @@ impl Reach {
         // A quad lies between two rows of vertices.
         for row in 0..height.saturating_sub(1) {
             let mut hull = (f32::INFINITY, f32::NEG_INFINITY);
-            for at in row * blocks..(row + 1) * blocks {
-                self.low[at] = min(self.low[at], self.low[at + blocks]);
-                self.high[at] = max(self.high[at], self.high[at + blocks]);
+            let done = &self.done[row / PATCH_ROWS * blocks..][..blocks];
+            for (at, &done) in (row * blocks..(row + 1) * blocks).zip(done) {
+                let low = min(self.low[at], self.low[at + blocks]);
+                let high = max(self.high[at], self.high[at + blocks]);
+                self.low[at] = if done { f32::INFINITY } else { low };
+                self.high[at] = if done { f32::NEG_INFINITY } else { high };
                 hull = (min(hull.0, self.low[at]), max(hull.1, self.high[at]));
             }
             self.rows.push(hull);
@@ -201,6 +240,7 @@ impl<'a> Projector<'a> {
         reach: &'a mut Reach,
     ) -> Self {
         let (h_matrix, h_offset) = homography(mesh, world_from_view, target, world_from_target);
+        reach.flatten(mesh, &h_matrix, &h_offset);
         reach.compute(mesh, &h_matrix, &h_offset);
         Self {
             mesh,
@@ -210,7 +250,7 @@ impl<'a> Projector<'a> {
         }
     }
 
-    /// Draws what falls into rows `strip` of the target. `map` is that strip, `strip.len() * width` samples, and keeps
+    /// Draws what falls into rows `strip` of the target. `map` is that strip, as large as [`map_size`] says, and keeps
     /// the nearer of what it holds and what is drawn.
     #[inline(always)]
     pub fn draw(
@@ -220,7 +260,18 @@ impl<'a> Projector<'a> {
         map: &mut [Sample],
         scratch: &mut ProjectScratch,
     ) {
-        assert_eq!(map.len(), width * strip.len(), "the map is the strip");
+        let pixels = width * strip.len();
+        assert_eq!(map.len(), map_size(pixels), "the map is the strip");
+        for flat in &self.reach.flat {
+            // As floats, because both may lie far outside.
+            let first = flat.low.max(strip.start as f32).ceil();
+            let last = flat.high.min(strip.end as f32 - 1.0);
+            if first <= last {
+                for y in first as usize..=last as usize {
+                    flat.draw_row(y, width, &mut map[(y - strip.start) * width..]);
+                }
+            }
+        }
         let columns = self.mesh.intrinsics.width;
         let mut target = Target { width, strip, map };
         // The row and columns that `lower` holds.
@@ -259,8 +310,11 @@ impl<'a> Projector<'a> {
                 lower: &scratch.lower,
                 cut,
             };
+            let low = &self.reach.low[row * self.mesh.blocks()..];
             for column in touched.step_by(LANES) {
-                quads.draw_block(column, &mut target, &mut block, &mut batch);
+                if low[column / LANES] < f32::INFINITY {
+                    quads.draw_block(column, &mut target, &mut block, &mut batch);
+                }
             }
         }
     }
@@ -802,4 +856,4 @@ fn draw_triangle(triangle: [Vertex; 3], target: &mut Target) {
 
 /// Of a triangle's weights and, in pixels, of its bounds: rounding in single precision must not open a crack between
 /// neighbours. A view drawn from its own pose has every pixel exactly on a vertex, those of the border too.
-const EDGE_SLACK: f32 = 1e-3;
+pub const EDGE_SLACK: f32 = 1e-3;
