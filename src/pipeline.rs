@@ -30,7 +30,6 @@ use crate::{
             prior::{self, Prior},
         },
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
-        select::select_into,
     },
 };
 
@@ -206,8 +205,10 @@ impl Pipeline {
         let records = std::mem::replace(&mut self.maps.score.posterior, spare);
         mesh.intrinsics = frame.intrinsics;
         std::mem::swap(&mut mesh.depth_m, &mut work.depth_m);
+        // Nothing else looks at half resolution.
+        let refined_against = self.settings.refine_pose.then_some(&mut coarse);
         self.engine
-            .prepare(&mut mesh, &records, &mut coarse, work.cut);
+            .prepare(&mut mesh, &records, refined_against, work.cut);
         let viewpoint = Viewpoint {
             coarse,
             id: 0,
@@ -387,19 +388,8 @@ impl Pipeline {
     }
 
     fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {
-        let poses = self
-            .memory
-            .viewpoints()
-            .iter()
-            .map(|viewpoint| &viewpoint.world_from_camera);
-        select_into(
-            poses,
-            world_from_camera,
-            self.settings.metres_per_radian,
-            self.settings.views,
-            self.settings.view_distance_max_m,
-            selected,
-        );
+        self.memory
+            .select(world_from_camera, &self.settings, selected);
     }
 
     fn ids(&self, selected: &[usize]) -> Vec<u64> {

@@ -27,6 +27,8 @@ use surprised::{
         attend::BlockMap,
         interpolate::prior::Prior,
         refine::{PoseRefiner, REFINE_VIEWS},
+        select::{Nearest, select_nearest},
+        view_tree::ViewTree,
     },
 };
 
@@ -197,7 +199,7 @@ impl Case {
             work.engine.prepare(
                 &mut work.mesh,
                 &work.score.posterior,
-                &mut work.coarse,
+                settings.refine_pose.then_some(&mut work.coarse),
                 settings.mesh_cut.into(),
             );
         });
@@ -373,5 +375,44 @@ fn main() {
             print!(" {name} {times}");
         }
         println!();
+    }
+    if full {
+        selection();
+    }
+}
+
+/// Seven of very many viewpoints: by looking at all of them, and by the tree.
+fn selection() {
+    let mut random = reference::Random(1);
+    let mut any = || {
+        let position = std::array::from_fn(|_| random.uniform(-20.0, 20.0));
+        reference::scene::pose(position, std::array::from_fn(|_| random.uniform(-3.0, 3.0)))
+    };
+    for count in [200, 10_000, 1_000_000] {
+        let views: Vec<_> = (0..count).map(|_| any()).collect();
+        let mut tree = ViewTree::default();
+        let mut build = Times::default();
+        timed(&mut build, || tree.build(views.iter()));
+        let (mut linear, mut by_tree) = (Times::default(), Times::default());
+        for _ in 0..30 {
+            let here = any();
+            timed(&mut linear, || {
+                select_nearest(views.iter(), &here, 1.0, 7, f64::INFINITY)
+            });
+            // Once is too short to be timed.
+            timed(&mut by_tree, || {
+                for _ in 0..100 {
+                    let mut nearest = Nearest::new(7);
+                    tree.offer(|index| &views[index], black_box(&here), 1.0, &mut nearest);
+                    black_box(nearest.farthest_m());
+                }
+            });
+        }
+        println!(
+            "select 7 of {count}: linear {:.4}, tree {:.4}, made once in {:.1} ms",
+            linear.median(),
+            by_tree.median() / 100.0,
+            build.median()
+        );
     }
 }

@@ -18,10 +18,7 @@ use crate::{
         pose::Pose,
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
-    stages::{
-        attend::BlockMap,
-        interpolate::prior::Prior,
-    },
+    stages::{attend::BlockMap, interpolate::prior::Prior},
 };
 
 use self::{
@@ -155,7 +152,13 @@ impl Engine {
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
-    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+    pub fn prepare(
+        &self,
+        mesh: &mut Mesh,
+        records: &[Record],
+        coarse: Option<&mut Coarse>,
+        cut: MeshCut,
+    ) {
         self.processor().prepare(mesh, records, coarse, cut);
     }
 

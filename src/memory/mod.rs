@@ -8,7 +8,14 @@ use crate::{
         pose::{Pose, view_distance_m},
         viewpoint::Viewpoint,
     },
+    stages::{
+        select::{Nearest, select_into},
+        view_tree::ViewTree,
+    },
 };
+
+/// Up to so many viewpoints are looked at one by one for each selection: a few microseconds.
+const LINEAR: usize = 256;
 
 /// The viewpoints of one place, in the order they were made.
 #[derive(Debug, Default)]
@@ -17,6 +24,8 @@ pub struct Memory {
     bytes: usize,
     last_id: u64,
     replaced_for_room: u64,
+    /// Kept beyond [`LINEAR`] viewpoints.
+    tree: ViewTree,
 }
 
 /// Where a posterior goes.
@@ -41,6 +50,50 @@ impl Memory {
     /// How often a viewpoint was overwritten only because the budget was full.
     pub fn replaced_for_room(&self) -> u64 {
         self.replaced_for_room
+    }
+
+    /// The indices of the viewpoints nearest to a pose, as [`select_into`] gives them.
+    pub fn select(&self, world_from_camera: &Pose, settings: &Settings, selected: &mut Vec<usize>) {
+        let Settings {
+            metres_per_radian,
+            views,
+            view_distance_max_m,
+            ..
+        } = *settings;
+        if self.viewpoints.len() <= LINEAR {
+            select_into(
+                self.viewpoints.iter().map(|view| &view.world_from_camera),
+                world_from_camera,
+                metres_per_radian,
+                views,
+                view_distance_max_m,
+                selected,
+            );
+            return;
+        }
+        let mut nearest = Nearest::new(views);
+        self.tree.offer(
+            |index| &self.viewpoints[index].world_from_camera,
+            world_from_camera,
+            metres_per_radian,
+            &mut nearest,
+        );
+        nearest.within(view_distance_max_m, selected);
+    }
+
+    /// Keeps the tree true to the viewpoints after a write.
+    fn index(&mut self, written: usize) {
+        let count = self.viewpoints.len();
+        if count <= LINEAR {
+            return;
+        }
+        self.tree.changed(written);
+        // Building takes as long as looking at several times `count` poses: where both cost the same a frame.
+        let loose = self.tree.loose();
+        if count == LINEAR + 1 || (loose > LINEAR && loose * loose > 8 * count) {
+            let poses = self.viewpoints.iter().map(|view| &view.world_from_camera);
+            self.tree.build(poses);
+        }
     }
 
     /// The slot for a posterior of `bytes` at a pose whose nearest viewpoints are `selected`, nearest first.
@@ -99,6 +152,10 @@ impl Memory {
             viewpoint.updates = 1;
         }
         let id = viewpoint.id;
+        let written = match slot {
+            Slot::Append => self.viewpoints.len(),
+            Slot::Overwrite(index) | Slot::Reuse(index) => index,
+        };
         self.bytes += viewpoint.bytes();
         let old = match slot {
             Slot::Append => {
@@ -112,6 +169,7 @@ impl Memory {
                 Some(old)
             }
         };
+        self.index(written);
         (id, old)
     }
 }

@@ -177,9 +177,17 @@ impl CpuEngine {
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
-    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+    pub fn prepare(
+        &self,
+        mesh: &mut Mesh,
+        records: &[Record],
+        coarse: Option<&mut Coarse>,
+        cut: MeshCut,
+    ) {
         join(self.isa, mesh, cut);
-        reduce(self.isa, coarse, mesh, records, cut);
+        if let Some(coarse) = coarse {
+            reduce(self.isa, coarse, mesh, records, cut);
+        }
     }
 
     /// Interpolates the beliefs at a pose from at most 16 views into `prior`.

@@ -22,7 +22,7 @@ const OVERLAP: f64 = 1.0 / 64.0;
 /// from the same side.
 const AREA_MIN: f64 = 0.05;
 /// Slopes of a border below this, pixels a pixel: it does not cross a row.
-const LEVEL: f64 = 1e-12;
+const LEVEL: f64 = 1e-9;
 
 /// How a patch is to be drawn.
 pub enum Drawable {
@@ -48,8 +48,9 @@ pub struct FlatPatch {
     /// In steps, plus [`INTEGER`].
     first_column: f32,
     first_row: f32,
-    /// `(x, y, 1)` lies inside where all four are not negative.
-    borders: [RowVector3<f64>; 4],
+    /// Borders to its left and to its right: `(x, slope)`, `x + slope * y` each.
+    lefts: [(f64, f64); 4],
+    rights: [(f64, f64); 4],
 }
 
 impl FlatPatch {
@@ -97,21 +98,38 @@ impl FlatPatch {
                 f64::from(EDGE_SLACK)
             }
         };
+        // `(x, y, 1)` lies inside where all four are not negative.
+        let borders = [
+            column + divisor * overlap(patch.column > 0),
+            divisor * (columns + overlap(patch.column + patch.columns + 1 < view.width)) - column,
+            row + divisor * overlap(patch.row > 0),
+            divisor * (rows + overlap(patch.row + patch.rows + 1 < view.height)) - row,
+        ];
+        let (mut lefts, mut rights) = ([(0.0, 0.0); 4], [(f64::INFINITY, 0.0); 4]);
+        (low, high) = (low - 0.5, high + 0.5);
+        for (index, border) in borders.iter().enumerate() {
+            let slope = border.x;
+            let line = (-border.z / slope, -border.y / slope);
+            if slope > LEVEL {
+                lefts[index] = line;
+            } else if slope < -LEVEL {
+                rights[index] = line;
+            } else if border.y > 0.0 {
+                low = low.max(-border.z / border.y);
+            } else {
+                high = high.min(-border.z / border.y);
+            }
+        }
         Drawable::Flat(Self {
-            low: (low - 0.5) as f32,
-            high: (high + 0.5) as f32,
+            low: low as f32,
+            high: high as f32,
             inverse_depth: plane * source,
             columns: columns as f32,
             rows: rows as f32,
             first_column: patch.column as f32 * STEPS + INTEGER,
             first_row: patch.row as f32 * STEPS + INTEGER,
-            borders: [
-                column + divisor * overlap(patch.column > 0),
-                divisor * (columns + overlap(patch.column + patch.columns + 1 < view.width))
-                    - column,
-                row + divisor * overlap(patch.row > 0),
-                divisor * (rows + overlap(patch.row + patch.rows + 1 < view.height)) - row,
-            ],
+            lefts,
+            rights,
             source,
         })
     }
@@ -120,21 +138,11 @@ impl FlatPatch {
     #[inline(always)]
     fn span(&self, y: f64, width: usize) -> (usize, usize) {
         let (mut first, mut last) = (0.0f64, width as f64 - 1.0);
-        for border in &self.borders {
-            let slope = border.x;
-            let at_zero = border.y * y + border.z;
-            if slope.abs() < LEVEL {
-                if at_zero < 0.0 {
-                    return (0, 0);
-                }
-            } else {
-                let crossing = -at_zero / slope;
-                if slope > 0.0 {
-                    first = if crossing > first { crossing } else { first };
-                } else {
-                    last = if crossing < last { crossing } else { last };
-                }
-            }
+        for ((left, left_slope), (right, right_slope)) in self.lefts.iter().zip(&self.rights) {
+            let left = left + left_slope * y;
+            let right = right + right_slope * y;
+            first = if left > first { left } else { first };
+            last = if right < last { right } else { last };
         }
         // Both are within the image, or there is nothing between them.
         let first = first.min(width as f64);

@@ -50,6 +50,16 @@ fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
         | steps(u)
 }
 
+/// The lower and the upper half of a sample -> u and v in steps, 1/depth.
+#[inline(always)]
+pub fn split(low: u32, high: u32) -> (u32, u32, f32) {
+    const OF_V: u32 = 2 * POSITION_BITS - 32;
+    let u = low & POSITION_MASK as u32;
+    let v = (low >> POSITION_BITS) | ((high << (32 - OF_V)) >> (POSITION_BITS - OF_V));
+    let inverse_depth = f32::from_bits((high >> OF_V) << INVERSE_DEPTH_SHIFT);
+    (u, v, inverse_depth)
+}
+
 /// 1/depth in the target camera, 1/metres.
 #[inline(always)]
 pub fn sample_inverse_depth(sample: Sample) -> f32 {
@@ -361,9 +371,10 @@ impl<'a> Projector<'a> {
         let xs = &mut vertices.x[touched.clone()];
         let ys = &mut vertices.y[touched.clone()];
         let inverse_depths = &mut vertices.inverse_depth[touched.clone()];
+        let first = touched.start as i32;
         for column in 0..depth_m.len() {
             let z = depth_m[column];
-            let at = (touched.start + column) as f32;
+            let at = (first + column as i32) as f32;
             let q_x = z * (m[(0, 0)] * at + start.x) + offset.x;
             let q_y = z * (m[(1, 0)] * at + start.y) + offset.y;
             let q_z = z * (m[(2, 0)] * at + start.z) + offset.z;
