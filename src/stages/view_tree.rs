@@ -104,13 +104,12 @@ impl ViewTree {
 
     /// Says that the pose at this index has changed or is new.
     pub fn changed(&mut self, index: usize) {
-        match self.moved.get_mut(index) {
-            Some(moved) if *moved => return,
-            Some(moved) => *moved = true,
-            None if self.loose.last() == Some(&index) => return,
-            None => {}
+        if index >= self.moved.len() {
+            self.moved.resize(index + 1, false);
         }
-        self.loose.push(index);
+        if !std::mem::replace(&mut self.moved[index], true) {
+            self.loose.push(index);
+        }
     }
 
     /// How many poses are looked at one by one.
