@@ -1,10 +1,11 @@
 //! Time of the hot path, whole and stage by stage, beside the plain scalar `f64` reference and a read of the same memory.
 //!
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
-//! pinned to one core then). `ISA=portable|avx2` chooses instructions. On a busy Xeon with AVX-512 (2.6 GHz), 320x240, 7
-//! views, one core, least of 8: `paper` 10.9 ms (recall 7.9, score 1.8, prepare 0.4, observe 0.1), the reference 159 ms,
-//! reading 1.5 ms; `robust` 17.4 ms (refine 3.3, recall 10.0, score 3.6). `peers.py`: remap of 70 planes 15.1 ms, MOG2 2.3
-//! ms, NumPy + SciPy 12.5 ms beside 11.5 ms.
+//! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a busy
+//! Xeon with AVX-512 (2.6 GHz), 320x240, 7 views, one core, least of 8, processor time: `paper` 7.3 ms (recall 5.8, score
+//! 1.0, prepare 0.2, observe 0.1), with noisy depth 8.5, the reference 152 ms, reading 1.9 ms; `robust` 13.7 ms (refine
+//! 3.0, recall 8.1, score 2.4, prepare 0.6). `peers.py`, least of 50: remap of 70 planes 13.8 ms, MOG2 2.5 ms, NumPy +
+//! SciPy 18.2 ms beside 8.5 ms.
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
