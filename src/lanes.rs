@@ -70,6 +70,13 @@ pub fn reciprocal(x: f32) -> f32 {
     r * (2.0 - x * r)
 }
 
+/// 1/x of three positive numbers by one division. Their product must be a normal number.
+#[inline(always)]
+pub fn reciprocals([a, b, c]: [f32; 3]) -> [f32; 3] {
+    let r = 1.0 / (a * b * c);
+    [r * (b * c), r * (a * c), r * (a * b)]
+}
+
 /// A bit mask of the lanes for which something holds.
 #[inline(always)]
 pub fn bits(holds: impl Fn(usize) -> bool) -> u32 {
@@ -105,4 +112,138 @@ pub fn prefetch<T>(slice: &[T], index: usize) {
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = at;
+}
+
+/// Eight words of sixteen pixels: a row a pixel, or a plane a word.
+pub type Rows = [[u32; 8]; LANES];
+pub type Planes = [[u32; LANES]; 8];
+
+/// Turns rows into planes and back.
+pub trait Transpose {
+    fn planes(rows: &Rows, planes: &mut Planes);
+    fn rows(planes: &Planes, rows: &mut Rows);
+}
+
+/// For any processor.
+pub struct Portable;
+
+impl Transpose for Portable {
+    #[inline(always)]
+    fn planes(rows: &Rows, planes: &mut Planes) {
+        for (k, plane) in planes.iter_mut().enumerate() {
+            for (word, row) in plane.iter_mut().zip(rows) {
+                *word = row[k];
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn rows(planes: &Planes, rows: &mut Rows) {
+        for (lane, row) in rows.iter_mut().enumerate() {
+            for (word, plane) in row.iter_mut().zip(planes) {
+                *word = plane[lane];
+            }
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub use x86::Avx;
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use std::arch::x86_64::*;
+
+    use super::{Planes, Rows, Transpose};
+
+    /// With AVX2: only for kernels that are compiled for it.
+    pub struct Avx;
+
+    impl Transpose for Avx {
+        #[inline(always)]
+        fn planes(rows: &Rows, planes: &mut Planes) {
+            // SAFETY: `Avx` is only named in kernels that are compiled for AVX2.
+            unsafe {
+                for half in 0..2 {
+                    let eight = transpose(std::array::from_fn(|k| load(&rows[8 * half + k])));
+                    for (plane, word) in planes.iter_mut().zip(eight) {
+                        let half = plane.as_chunks_mut::<8>().0.get_unchecked_mut(half);
+                        store(half, word);
+                    }
+                }
+            }
+        }
+
+        #[inline(always)]
+        fn rows(planes: &Planes, rows: &mut Rows) {
+            // SAFETY: as above.
+            unsafe {
+                for half in 0..2 {
+                    let eight = transpose(std::array::from_fn(|k| {
+                        load(planes[k].as_chunks::<8>().0.get_unchecked(half))
+                    }));
+                    for (k, word) in eight.into_iter().enumerate() {
+                        store(&mut rows[8 * half + k], word);
+                    }
+                }
+            }
+        }
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn load(words: &[u32; 8]) -> __m256 {
+        // SAFETY: eight words.
+        unsafe { _mm256_loadu_ps(words.as_ptr().cast()) }
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn store(words: &mut [u32; 8], value: __m256) {
+        // SAFETY: eight words.
+        unsafe { _mm256_storeu_ps(words.as_mut_ptr().cast(), value) }
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn transpose(r: [__m256; 8]) -> [__m256; 8] {
+        let (a0, a1) = (
+            _mm256_unpacklo_ps(r[0], r[1]),
+            _mm256_unpackhi_ps(r[0], r[1]),
+        );
+        let (b0, b1) = (
+            _mm256_unpacklo_ps(r[2], r[3]),
+            _mm256_unpackhi_ps(r[2], r[3]),
+        );
+        let (c0, c1) = (
+            _mm256_unpacklo_ps(r[4], r[5]),
+            _mm256_unpackhi_ps(r[4], r[5]),
+        );
+        let (d0, d1) = (
+            _mm256_unpacklo_ps(r[6], r[7]),
+            _mm256_unpackhi_ps(r[6], r[7]),
+        );
+        let left = [
+            _mm256_shuffle_ps::<0b01_00_01_00>(a0, b0),
+            _mm256_shuffle_ps::<0b11_10_11_10>(a0, b0),
+            _mm256_shuffle_ps::<0b01_00_01_00>(a1, b1),
+            _mm256_shuffle_ps::<0b11_10_11_10>(a1, b1),
+        ];
+        let right = [
+            _mm256_shuffle_ps::<0b01_00_01_00>(c0, d0),
+            _mm256_shuffle_ps::<0b11_10_11_10>(c0, d0),
+            _mm256_shuffle_ps::<0b01_00_01_00>(c1, d1),
+            _mm256_shuffle_ps::<0b11_10_11_10>(c1, d1),
+        ];
+        [
+            _mm256_permute2f128_ps::<0x20>(left[0], right[0]),
+            _mm256_permute2f128_ps::<0x20>(left[1], right[1]),
+            _mm256_permute2f128_ps::<0x20>(left[2], right[2]),
+            _mm256_permute2f128_ps::<0x20>(left[3], right[3]),
+            _mm256_permute2f128_ps::<0x31>(left[0], right[0]),
+            _mm256_permute2f128_ps::<0x31>(left[1], right[1]),
+            _mm256_permute2f128_ps::<0x31>(left[2], right[2]),
+            _mm256_permute2f128_ps::<0x31>(left[3], right[3]),
+        ]
+    }
 }

@@ -33,7 +33,6 @@ use crate::{
         },
         next_view::{self, Promise},
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
-        select::select_into,
         update::UpdateRules,
     },
 };
@@ -295,10 +294,12 @@ impl Pipeline {
         fresh.stamp_ns = frame.stamp_ns;
         fresh.mesh.intrinsics = frame.intrinsics;
         std::mem::swap(&mut fresh.mesh.depth_m, &mut work.depth_m);
-        fresh.records.clear();
-        fresh.records.extend_from_slice(&self.maps.score.posterior);
+        // The next posterior is written where records were that nobody needs.
+        std::mem::swap(&mut fresh.records, &mut self.maps.score.posterior);
+        // Nothing else looks at half resolution.
+        let refined_against = self.settings.refine_pose.then_some(&mut fresh.coarse);
         self.engine
-            .prepare(&mut fresh.mesh, &fresh.records, &mut fresh.coarse, work.cut);
+            .prepare(&mut fresh.mesh, &fresh.records, refined_against, work.cut);
         let slot = self.memory.slot(
             &work.selected,
             world_from_camera,
@@ -507,19 +508,8 @@ impl Pipeline {
     }
 
     fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {
-        let poses = self
-            .memory
-            .viewpoints()
-            .iter()
-            .map(|viewpoint| &viewpoint.world_from_camera);
-        select_into(
-            poses,
-            world_from_camera,
-            self.settings.metres_per_radian,
-            self.settings.views,
-            self.settings.view_distance_max_m,
-            selected,
-        );
+        self.memory
+            .select(world_from_camera, &self.settings, selected);
     }
 
     fn ids(&self, selected: &[usize]) -> Vec<u64> {

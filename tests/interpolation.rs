@@ -10,7 +10,12 @@ use reference::{
 use surprised::{
     config::{Preset, Settings},
     engine::cpu::{CpuEngine, RecallView},
-    model::{belief::Record, camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
+    model::{
+        belief::Record,
+        camera::Intrinsics,
+        pose::Pose,
+        viewpoint::{Mesh, Viewpoint},
+    },
     stages::interpolate::prior::{self, Prior},
 };
 
@@ -206,6 +211,56 @@ fn a_wall_and_what_stands_before_it_are_recalled_from_a_new_pose() {
         let counts = assert_recall_is_true(&scene, &cameras(), &target, &world_from_target, 0.02);
         assert!(counts[2] > 5000, "{counts:?}");
     }
+}
+
+#[test]
+fn flat_parts_drawn_whole_are_where_their_triangles_are() {
+    let scene = Scene {
+        panels: vec![wall(0.3), occluder()],
+    };
+    let mut random = Random(11);
+    let (mut tau, mut covered, mut same, mut pixels) = (0.0, 0.0, 0.0, 0.0);
+    for _ in 0..6 {
+        let mut flat = scene.viewpoint(&camera(200, 150), &pose([0.0; 3], [0.0; 3]));
+        // Depth that is not quite flat: as far off as patches may be.
+        for z in &mut flat.mesh.depth_m {
+            *z = 1.0 / (1.0 / *z + random.uniform(-1.5e-4, 1.5e-4) as f32);
+        }
+        let depth_m = std::mem::take(&mut flat.mesh.depth_m);
+        flat.mesh = Mesh::new(flat.mesh.intrinsics, depth_m, 0.05);
+        let quads: usize = flat.mesh.patches.iter().map(|p| p.columns * p.rows).sum();
+        assert!(quads * 2 > flat.mesh.cut.len(), "{quads} quads in patches");
+        let mut triangles = flat.clone();
+        triangles.mesh.patches.clear();
+        let target = camera(199, 149);
+        let here = pose(
+            std::array::from_fn(|_| random.uniform(-0.2, 0.2)),
+            std::array::from_fn(|_| random.uniform(-0.1, 0.1)),
+        );
+        let settings = Settings::paper();
+        let got = recall(&settings, &[&flat], &target, &here);
+        let expected = recall(&settings, &[&triangles], &target, &here);
+        for (pixel, (got_count, count)) in got
+            .plane(prior::COVERAGE)
+            .zip(expected.plane(prior::COVERAGE))
+            .enumerate()
+        {
+            pixels += 1.0;
+            same += f64::from(u8::from(got_count == count));
+            if got_count.min(count) > 0.0 {
+                let (x, y) = (pixel % target.width, pixel / target.width);
+                let (a, b) = (got.belief(x, y).tau[0], expected.belief(x, y).tau[0]);
+                tau += f64::from((a - b).abs());
+                covered += 1.0;
+            }
+        }
+    }
+    assert!(
+        tau / covered <= 0.02,
+        "mean difference of tau {}",
+        tau / covered
+    );
+    assert!(same / pixels >= 0.995, "as many views: {}", same / pixels);
 }
 
 #[test]

@@ -6,7 +6,11 @@ use nalgebra::Vector3;
 use reference::{Random, scene::pose};
 use surprised::{
     model::pose::Pose,
-    stages::{exposure::exposure_gain, select::select_nearest},
+    stages::{
+        exposure::exposure_gain,
+        select::{Nearest, select_nearest},
+        view_tree::ViewTree,
+    },
 };
 
 #[test]
@@ -37,6 +41,54 @@ fn the_nearest_viewpoints_are_those_of_sorting_them_all() {
             expected.truncate(7);
             let got = select_nearest(views.iter(), &here, metres_per_radian, 7, f64::INFINITY);
             assert_eq!(got, expected, "{count} views, {metres_per_radian} m/rad");
+        }
+    }
+}
+
+#[test]
+fn the_tree_selects_what_looking_at_every_viewpoint_selects() {
+    let mut random = Random(7);
+    let any = |random: &mut Random| {
+        // Several at the same place, as from a robot that turns.
+        let place = random.below(12) as f64;
+        pose(
+            [place, 0.2 * random.uniform(-1.0, 1.0), place * place / 10.0],
+            std::array::from_fn(|_| random.uniform(-1.5, 1.5)),
+        )
+    };
+    for count in [0usize, 1, 15, 40, 3000] {
+        let mut views: Vec<Pose> = (0..count).map(|_| any(&mut random)).collect();
+        let mut tree = ViewTree::default();
+        tree.build(views.iter());
+        for round in 0..60 {
+            // Some move, some come, some stand where another stands.
+            if count > 0 {
+                let index = random.below(views.len());
+                views[index] = views[random.below(views.len())];
+                tree.changed(index);
+                views.push(any(&mut random));
+                tree.changed(views.len() - 1);
+            }
+            let here = any(&mut random);
+            for (metres_per_radian, distance_max_m) in
+                [(0.0, f64::INFINITY), (1.0, 0.7), (3.0, 2.0)]
+            {
+                let expected =
+                    select_nearest(views.iter(), &here, metres_per_radian, 7, distance_max_m);
+                let mut nearest = Nearest::new(7);
+                tree.offer(
+                    |index| &views[index],
+                    &here,
+                    metres_per_radian,
+                    &mut nearest,
+                );
+                let mut got = Vec::new();
+                nearest.within(distance_max_m, &mut got);
+                assert_eq!(
+                    got, expected,
+                    "{count} views, round {round}, {metres_per_radian} m/rad"
+                );
+            }
         }
     }
 }

@@ -1,10 +1,11 @@
 //! Time of the hot path, whole and stage by stage, beside the plain scalar `f64` reference and a read of the same memory.
 //!
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
-//! pinned to one core then). `ISA=portable|avx2` chooses instructions. On a busy Xeon with AVX-512 (2.6 GHz), 320x240, 7
-//! views, one core, least of 8: `paper` 10.9 ms (recall 7.9, score 1.8, prepare 0.4, observe 0.1), the reference 159 ms,
-//! reading 1.5 ms; `robust` 17.4 ms (refine 3.3, recall 10.0, score 3.6). `peers.py`: remap of 70 planes 15.1 ms, MOG2 2.3
-//! ms, NumPy + SciPy 12.5 ms beside 11.5 ms.
+//! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a busy
+//! Xeon with AVX-512 (2.6 GHz), 320x240, 7 views, one core, least of 8, processor time: `paper` 7.3 ms (recall 5.8, score
+//! 1.0, prepare 0.2, observe 0.1), with noisy depth 8.5, the reference 152 ms, reading 1.9 ms; `robust` 13.7 ms (refine
+//! 3.0, recall 8.1, score 2.4, prepare 0.6). `peers.py`, least of 50: remap of 70 planes 13.8 ms, MOG2 2.5 ms, NumPy +
+//! SciPy 18.2 ms beside 8.5 ms.
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
@@ -27,6 +28,8 @@ use surprised::{
         attend::BlockMap,
         interpolate::prior::Prior,
         refine::{PoseRefiner, REFINE_VIEWS},
+        select::{Nearest, select_nearest},
+        view_tree::ViewTree,
     },
 };
 
@@ -197,7 +200,7 @@ impl Case {
             work.engine.prepare(
                 &mut work.mesh,
                 &work.score.posterior,
-                &mut work.coarse,
+                settings.refine_pose.then_some(&mut work.coarse),
                 settings.mesh_cut.into(),
             );
         });
@@ -373,5 +376,44 @@ fn main() {
             print!(" {name} {times}");
         }
         println!();
+    }
+    if full {
+        selection();
+    }
+}
+
+/// Seven of very many viewpoints: by looking at all of them, and by the tree.
+fn selection() {
+    let mut random = reference::Random(1);
+    let mut any = || {
+        let position = std::array::from_fn(|_| random.uniform(-20.0, 20.0));
+        reference::scene::pose(position, std::array::from_fn(|_| random.uniform(-3.0, 3.0)))
+    };
+    for count in [200, 10_000, 1_000_000] {
+        let views: Vec<_> = (0..count).map(|_| any()).collect();
+        let mut tree = ViewTree::default();
+        let mut build = Times::default();
+        timed(&mut build, || tree.build(views.iter()));
+        let (mut linear, mut by_tree) = (Times::default(), Times::default());
+        for _ in 0..30 {
+            let here = any();
+            timed(&mut linear, || {
+                select_nearest(views.iter(), &here, 1.0, 7, f64::INFINITY)
+            });
+            // Once is too short to be timed.
+            timed(&mut by_tree, || {
+                for _ in 0..100 {
+                    let mut nearest = Nearest::new(7);
+                    tree.offer(|index| &views[index], black_box(&here), 1.0, &mut nearest);
+                    black_box(nearest.farthest_m());
+                }
+            });
+        }
+        println!(
+            "select 7 of {count}: linear {:.4}, tree {:.4}, made once in {:.1} ms",
+            linear.median(),
+            by_tree.median() / 100.0,
+            build.median()
+        );
     }
 }

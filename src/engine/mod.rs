@@ -21,7 +21,7 @@ use crate::{
     },
     stages::{
         attend::BlockMap,
-        interpolate::prior::{self, Prior},
+        interpolate::prior::Prior,
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
     },
 };
@@ -226,7 +226,13 @@ impl Engine {
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
-    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+    pub fn prepare(
+        &self,
+        mesh: &mut Mesh,
+        records: &[Record],
+        coarse: Option<&mut Coarse>,
+        cut: MeshCut,
+    ) {
         self.processor().prepare(mesh, records, coarse, cut);
     }
 
@@ -346,21 +352,19 @@ fn compare_on_processor(
         evidence: found,
         blocks,
     } = answer;
-    engine.recall(
-        question.views,
-        question.intrinsics,
-        question.world_from_camera,
-        prior,
-    );
-    observed(engine, question, |observation| {
-        engine.score(prior, observation, score);
+    let seen = observed(engine, question, |observation| {
+        engine.compare(
+            question.views,
+            question.intrinsics,
+            question.world_from_camera,
+            observation,
+            prior,
+            score,
+        )
     });
     found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {
-        seen: prior
-            .plane(prior::COVERAGE)
-            .filter(|&count| count > 0.0)
-            .count(),
+        seen,
         maps_read: true,
     }
 }

@@ -22,7 +22,14 @@ use crate::{
         pose::{Pose, view_distance_m},
         viewpoint::Viewpoint,
     },
+    stages::{
+        select::{Nearest, select_into},
+        view_tree::ViewTree,
+    },
 };
+
+/// Up to so many viewpoints are looked at one by one for each selection: a few microseconds.
+const LINEAR: usize = 256;
 
 /// The viewpoints of one place.
 #[derive(Debug, Default)]
@@ -41,6 +48,10 @@ pub struct Memory {
     last_id: u64,
     replaced_for_room: u64,
     evicted: u64,
+    /// Kept beyond [`LINEAR`] viewpoints.
+    tree: ViewTree,
+    /// Viewpoints came or went, so the tree says nothing until it is built again.
+    tree_stale: bool,
 }
 
 /// Which state of a viewpoint is stored: under which lease it was written, and its revision. Later ones are greater.
@@ -74,6 +85,56 @@ impl Memory {
     /// How often a viewpoint was overwritten only because the budget was full.
     pub fn replaced_for_room(&self) -> u64 {
         self.replaced_for_room
+    }
+
+    /// The indices of the viewpoints nearest to a pose, as [`select_into`] gives them.
+    pub fn select(&self, world_from_camera: &Pose, settings: &Settings, selected: &mut Vec<usize>) {
+        let Settings {
+            metres_per_radian,
+            views,
+            view_distance_max_m,
+            ..
+        } = *settings;
+        if self.viewpoints.len() <= LINEAR || self.tree_stale {
+            select_into(
+                self.viewpoints.iter().map(|view| &view.world_from_camera),
+                world_from_camera,
+                metres_per_radian,
+                views,
+                view_distance_max_m,
+                selected,
+            );
+            return;
+        }
+        let mut nearest = Nearest::new(views);
+        self.tree.offer(
+            |index| &self.viewpoints[index].world_from_camera,
+            world_from_camera,
+            metres_per_radian,
+            &mut nearest,
+        );
+        nearest.within(view_distance_max_m, selected);
+    }
+
+    /// Keeps the tree true to the viewpoints after a write.
+    fn index(&mut self, written: usize) {
+        let count = self.viewpoints.len();
+        if count <= LINEAR {
+            return;
+        }
+        if self.tree_stale {
+            self.tree_stale = false;
+            let poses = self.viewpoints.iter().map(|view| &view.world_from_camera);
+            self.tree.build(poses);
+            return;
+        }
+        self.tree.changed(written);
+        // Building takes as long as looking at several times `count` poses: where both cost the same a frame.
+        let loose = self.tree.loose();
+        if count == LINEAR + 1 || (loose > LINEAR && loose * loose > 8 * count) {
+            let poses = self.viewpoints.iter().map(|view| &view.world_from_camera);
+            self.tree.build(poses);
+        }
     }
 
     /// The slot for a posterior of `bytes` at a pose whose nearest viewpoints are `selected`, nearest first.
@@ -138,6 +199,10 @@ impl Memory {
             written.updates = 1;
         }
         let id = viewpoint.id;
+        let written = match slot {
+            Slot::Append => self.viewpoints.len(),
+            Slot::Overwrite(index) | Slot::Reuse(index) => index,
+        };
         self.bytes += viewpoint.bytes();
         let new = Mark::new(self.turn);
         let old = match slot {
@@ -160,6 +225,7 @@ impl Memory {
             }
         };
         self.note(id);
+        self.index(written);
         (id, old)
     }
 

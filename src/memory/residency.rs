@@ -171,6 +171,7 @@ impl Memory {
         self.absent.remove(&viewpoint.id);
         self.bytes += viewpoint.bytes();
         self.viewpoints.push(viewpoint);
+        self.tree_stale = true;
         self.marks.push(Mark {
             revision: stored.revision,
             stored: Some(stored),
@@ -269,6 +270,7 @@ impl Memory {
 
     fn drop_resident(&mut self, index: usize) {
         let gone = self.viewpoints.remove(index);
+        self.tree_stale = true;
         self.marks.remove(index);
         self.bytes -= gone.bytes();
     }

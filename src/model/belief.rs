@@ -5,7 +5,7 @@
 //! it is no standard deviation. `alpha` does not depend on the data, so one value serves Y, Cb and Cr.
 //! A second appearance (`tau2`, with weight `p2`) remembers what was there before a change.
 
-use crate::lanes::{LANES, Lanes};
+use crate::lanes::{LANES, Lanes, Planes, Transpose};
 
 /// Y, Cb, Cr.
 pub const CHANNELS: usize = 3;
@@ -117,36 +117,29 @@ impl Record {
 
     /// The same bits as [`Self::pack`].
     #[inline(always)]
-    pub fn pack_lanes(beliefs: &BeliefLanes, records: &mut [Self; LANES]) {
-        let mut spread = [[0u16; LANES]; 8];
-        let planes = [
-            &beliefs.alpha,
-            &beliefs.beta[0],
-            &beliefs.beta[1],
-            &beliefs.beta[2],
-            &beliefs.sigma[0],
-            &beliefs.sigma[1],
-            &beliefs.sigma[2],
-        ];
-        for (packed, plane) in spread.iter_mut().zip(planes) {
-            for lane in 0..LANES {
-                packed[lane] = f16_from_f32(plane[lane].clamp(SPREAD_MIN, SPREAD_MAX));
-            }
-        }
+    pub fn pack_lanes<T: Transpose>(beliefs: &BeliefLanes, records: &mut [Self; LANES]) {
+        // Two values a word, as records hold them side by side.
+        let mut words: Planes = [[0; LANES]; 8];
+        let BeliefLanes {
+            alpha,
+            beta,
+            tau,
+            sigma,
+        } = beliefs;
+        let spread = |value: f32| u32::from(f16_from_f32(value.clamp(SPREAD_MIN, SPREAD_MAX)));
+        let level =
+            |value: f32, k: usize| u32::from(level_from(value - LEVEL_OFFSET[k]).cast_unsigned());
         // The second appearance is at its stored zero.
-        let mut level = [[0i16; LANES]; 8];
-        for (channel, (packed, plane)) in level.iter_mut().zip(&beliefs.tau).enumerate() {
-            for lane in 0..LANES {
-                packed[lane] = level_from(plane[lane] - LEVEL_OFFSET[channel]);
-            }
+        let none = level(0.0, CHANNELS) << 16;
+        for lane in 0..LANES {
+            words[0][lane] = spread(alpha[lane]) | (spread(beta[0][lane]) << 16);
+            words[1][lane] = spread(beta[1][lane]) | (spread(beta[2][lane]) << 16);
+            words[2][lane] = spread(sigma[0][lane]) | (spread(sigma[1][lane]) << 16);
+            words[3][lane] = spread(sigma[2][lane]);
+            words[4][lane] = level(tau[0][lane], 0) | (level(tau[1][lane], 1) << 16);
+            words[5][lane] = level(tau[2][lane], 2) | none;
         }
-        level[CHANNELS] = [level_from(-LEVEL_OFFSET[CHANNELS]); LANES];
-        for (lane, record) in records.iter_mut().enumerate() {
-            for k in 0..8 {
-                record.spread[k] = spread[k][lane];
-                record.level[k] = level[k][lane];
-            }
-        }
+        T::rows(&words, bytemuck::cast_mut(records));
     }
 
     #[inline(always)]

@@ -7,6 +7,7 @@ pub mod camera;
 pub mod frame;
 
 pub mod mode;
+pub mod patch;
 
 pub mod pose;
 

@@ -6,6 +6,7 @@ use super::{
     belief::{Belief, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
     camera::Intrinsics,
     frame::Source,
+    patch::{self, Patch},
     pose::Pose,
 };
 
@@ -55,6 +56,8 @@ pub struct Mesh {
     /// any.
     pub block_nearest_m: Vec<f32>,
     pub block_farthest_m: Vec<f32>,
+    /// The flat parts; no two share a quad.
+    pub patches: Vec<Patch>,
 }
 
 impl Mesh {
@@ -80,6 +83,7 @@ impl Mesh {
         self.cut.clear();
         self.cut
             .resize(width.saturating_sub(1) * height.saturating_sub(1), 0);
+        self.patches.clear();
         // Half of a camera one pixel wide has no column.
         if width < 2 {
             return;
@@ -99,6 +103,7 @@ impl Mesh {
                     u8::from(upper_left) * UPPER_LEFT + u8::from(lower_right) * LOWER_RIGHT;
             }
         }
+        patch::find(&self.depth_m, &self.cut, width, &mut self.patches);
     }
 
     /// Least and greatest depth of every block.
@@ -157,6 +162,10 @@ impl Mesh {
             }
         }
         self.find_ranges();
+        self.patches.clear();
+        if width >= 2 {
+            patch::find(&self.depth_m, &self.cut, width, &mut self.patches);
+        }
     }
 
     /// Blocks of sixteen quads in a row.
@@ -169,6 +178,7 @@ impl Mesh {
             + size_of_val(self.cut.as_slice())
             + size_of_val(self.block_nearest_m.as_slice())
             + size_of_val(self.block_farthest_m.as_slice())
+            + self.patches.capacity() * size_of::<Patch>()
     }
 }
 

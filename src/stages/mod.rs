@@ -12,6 +12,8 @@ pub mod depth;
 
 pub mod select;
 
+pub mod view_tree;
+
 pub mod refine;
 
 pub mod interpolate;

@@ -32,7 +32,10 @@ use crate::{
     config::UnseenStart,
     model::{belief::CHANNELS, pose::Pose},
     stages::{
-        interpolate::prior::{self, Prior},
+        interpolate::{
+            merge::UNSEEN,
+            prior::{self, Prior},
+        },
         update::UpdateRules,
     },
 };
@@ -62,10 +65,9 @@ pub fn unseen_reduction(rules: &UpdateRules) -> f32 {
         }
         // (1, 1, 0, 5) after one observation of anything.
         UnseenStart::Paper => {
-            let (alpha, beta, sigma) = (1.0, 1.0, 5.0);
-            let observed = UNKNOWN_VARIANCE.sqrt();
-            let (beta1, _, sigma1) = rules.channel(alpha, (beta, 0.0, sigma), observed);
-            beta1 / rules.alpha(alpha) * (1.0 + sigma1)
+            let observed = [UNKNOWN_VARIANCE.sqrt(); CHANNELS];
+            let after = rules.belief(&UNSEEN, observed);
+            after.beta[0] / after.alpha * (1.0 + after.sigma[0])
         }
     };
     CHANNELS as f32 * (UNKNOWN_VARIANCE - after).max(0.0)

@@ -16,7 +16,7 @@ use crate::{
         viewpoint::Coarse,
     },
     stages::interpolate::project::{
-        ProjectScratch, Projector, Reach, Sample, draw, sample_depth_m, sample_position,
+        ProjectScratch, Projector, Reach, Sample, draw, map_size, sample_depth_m, sample_position,
     },
 };
 
@@ -319,12 +319,12 @@ impl PoseRefiner {
         world_from_camera: &Pose,
         level: &mut Level,
     ) {
-        let pixels = camera.pixels();
+        let map_size = map_size(camera.pixels());
         let views = &views[..views.len().min(REFINE_VIEWS)];
         self.maps.clear();
-        self.maps.resize(pixels * REFINE_VIEWS, 0);
+        self.maps.resize(map_size * REFINE_VIEWS, 0);
         for ((coarse, world_from_view, _), map) in
-            views.iter().zip(self.maps.chunks_exact_mut(pixels.max(1)))
+            views.iter().zip(self.maps.chunks_exact_mut(map_size))
         {
             let projector = Projector::new(
                 &coarse.mesh,
@@ -724,7 +724,7 @@ fn compare_kernel(
 }
 
 for_each_isa! {
-    /// Luminance, variance and depth from the maps of the views.
+    /// Luminance, variance and depth from the maps of the views, each as [`map_size`] says.
     fn expect(
         views: &[(&Coarse, &Pose, f32)],
         maps: &[Sample],
@@ -739,7 +739,7 @@ fn expect_kernel(views: &[(&Coarse, &Pose, f32)], maps: &[Sample], level: &mut L
         let mut seen = [(0.0f32, 0.0f32, 0.0f32, 0.0f32); REFINE_VIEWS];
         let mut count = 0;
         for (view, (coarse, _, weight)) in views.iter().enumerate() {
-            let sample = maps[view * pixels + pixel];
+            let sample = maps[view * map_size(pixels) + pixel];
             if sample != 0 {
                 let (luminance, variance) = interpolate(coarse, sample);
                 seen[count] = (sample_depth_m(sample), luminance, variance, *weight);

@@ -43,26 +43,61 @@ pub fn select_into<'a>(
     distance_max_m: f64,
     selected: &mut Vec<usize>,
 ) {
-    // Sorted by distance; the earlier index stays before an equal distance.
-    let mut nearest = ArrayVec::<(f64, usize), VIEWS_MAX>::new();
-    let count = count.min(VIEWS_MAX);
+    let mut nearest = Nearest::new(count);
     for (index, world_from_view) in world_from_views.enumerate() {
         let distance_m = view_distance_m(world_from_view, world_from_camera, metres_per_radian);
-        if nearest.len() == count {
-            if nearest.last().is_none_or(|last| last.0 <= distance_m) {
-                continue;
-            }
-            nearest.pop();
-        }
-        let rank = nearest.partition_point(|held| held.0 <= distance_m);
-        nearest.insert(rank, (distance_m, index));
+        nearest.offer(distance_m, index);
     }
-    selected.clear();
-    selected.extend(
-        nearest
-            .into_iter()
-            .enumerate()
-            .filter(|(rank, (distance_m, _))| *rank < NEAREST_KEPT || *distance_m <= distance_max_m)
-            .map(|(_, (_, index))| index),
-    );
+    nearest.within(distance_max_m, selected);
+}
+
+/// The nearest of what was offered: sorted by distance, the earlier index before an equal distance.
+pub struct Nearest {
+    held: ArrayVec<(f64, usize), VIEWS_MAX>,
+    count: usize,
+}
+
+impl Nearest {
+    /// Holds at most `count`.
+    pub fn new(count: usize) -> Self {
+        Self {
+            held: ArrayVec::new(),
+            count: count.min(VIEWS_MAX),
+        }
+    }
+
+    /// What is farther than this is not held; infinite while there is room.
+    pub fn farthest_m(&self) -> f64 {
+        if self.held.len() < self.count {
+            return f64::INFINITY;
+        }
+        self.held.last().map_or(f64::NEG_INFINITY, |last| last.0)
+    }
+
+    /// In any order.
+    pub fn offer(&mut self, distance_m: f64, index: usize) {
+        let before = |held: &(f64, usize)| (held.0, held.1) < (distance_m, index);
+        if self.held.len() == self.count {
+            if self.held.last().is_none_or(before) {
+                return;
+            }
+            self.held.pop();
+        }
+        let rank = self.held.partition_point(before);
+        self.held.insert(rank, (distance_m, index));
+    }
+
+    /// Their indices; of those beyond `distance_max_m` only the nearest three.
+    pub fn within(self, distance_max_m: f64, selected: &mut Vec<usize>) {
+        selected.clear();
+        selected.extend(
+            self.held
+                .into_iter()
+                .enumerate()
+                .filter(|(rank, (distance_m, _))| {
+                    *rank < NEAREST_KEPT || *distance_m <= distance_max_m
+                })
+                .map(|(_, (_, index))| index),
+        );
+    }
 }

@@ -6,9 +6,9 @@
 //! the robust preset). Edges may widen the prior for the score (step 4).
 
 use crate::{
-    lanes::ln,
+    lanes::{ln, reciprocals},
     model::belief::{Belief, CHANNELS},
-    stages::update::UpdateRules,
+    stages::update::{Channels, UpdateRules},
 };
 
 pub(crate) const DEGREE: usize = 12;
@@ -97,31 +97,31 @@ fn digamma(x: f64) -> f64 {
         - r * (1.0 / 12.0 - r * (1.0 / 120.0 - r * (1.0 / 252.0 - r * (1.0 / 240.0 - r / 132.0))))
 }
 
-/// The parts of a channel's surprise that need no logarithm. Beliefs are `(beta, sigma)`; `deviation` is the
-/// observation's from tau0.
+/// (16) to (23), nats: of a prior, the one that was updated, and its posterior. `deviation` is the observation's from
+/// tau0. The channels share divisions and logarithms: products of three stay below 1e16.
 #[inline(always)]
-pub fn plain_terms(alpha: f32, prior: (f32, f32), posterior: (f32, f32), deviation: f32) -> f32 {
-    let (beta0, sigma0) = prior;
-    let (beta, sigma) = posterior;
-    let precision = alpha / beta;
-    // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
-    let moved = sigma * deviation;
-    (beta0 - beta) * precision + (moved * moved * precision + sigma) / (2.0 * sigma0) - 0.5
-}
-
-/// (16) to (23), nats. `plain` is the channels' sum; beta and sigma, of prior and posterior, are their products: at most
-/// 65504^3.
-#[inline(always)]
-pub fn total(
-    alpha0: f32,
-    plain: f32,
-    (beta0, sigma0): (f32, f32),
-    (beta, sigma): (f32, f32),
+pub fn divergence(
+    (alpha0, prior): (f32, &Channels),
+    (alpha, posterior): (f32, &Channels),
+    deviation: [f32; CHANNELS],
     gamma: &GammaTerm,
 ) -> f32 {
+    let per_beta = reciprocals(posterior.beta);
+    let per_sigma0 = reciprocals(prior.sigma);
+    let mut plain = 0.0;
+    for c in 0..CHANNELS {
+        let (beta0, beta, sigma) = (prior.beta[c], posterior.beta[c], posterior.sigma[c]);
+        let precision = alpha * per_beta[c];
+        // tau - tau0 by (14): the difference of the two would have few digits left, which a small beta magnifies.
+        let moved = sigma * deviation[c];
+        plain += (beta0 - beta) * precision
+            + 0.5 * (moved * moved * precision + sigma) * per_sigma0[c]
+            - 0.5;
+    }
+    let product = |[a, b, c]: [f32; CHANNELS]| a * b * c;
     let sum = plain
-        + alpha0 * ln(beta / beta0)
-        + 0.5 * ln(sigma0 / sigma)
+        + alpha0 * ln(product(posterior.beta) / product(prior.beta))
+        + 0.5 * ln(product(prior.sigma) / product(posterior.sigma))
         + CHANNELS as f32 * gamma.at(alpha0);
     // A divergence is never negative; rounding may be.
     sum.max(0.0)
@@ -135,25 +135,10 @@ pub fn surprise(
     observed: [f32; CHANNELS],
     gamma: &GammaTerm,
 ) -> f32 {
-    let mut plain = 0.0;
-    for (c, observed) in observed.into_iter().enumerate() {
-        plain += plain_terms(
-            posterior.alpha,
-            (prior.beta[c], prior.sigma[c]),
-            (posterior.beta[c], posterior.sigma[c]),
-            observed - prior.tau[c],
-        );
-    }
-    let products = |belief: &Belief| {
-        let [b0, b1, b2] = belief.beta;
-        let [s0, s1, s2] = belief.sigma;
-        (b0 * b1 * b2, s0 * s1 * s2)
-    };
-    total(
-        prior.alpha,
-        plain,
-        products(prior),
-        products(posterior),
+    divergence(
+        (prior.alpha, &prior.into()),
+        (posterior.alpha, &posterior.into()),
+        std::array::from_fn(|c| observed[c] - prior.tau[c]),
         gamma,
     )
 }

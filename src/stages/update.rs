@@ -6,7 +6,7 @@
 
 use crate::{
     config::{Settings, UnseenStart},
-    lanes::exp,
+    lanes::{exp, reciprocals},
     model::belief::{Belief, CHANNELS},
 };
 
@@ -25,6 +25,30 @@ pub struct UpdateRules {
     pub second_look: bool,
     pub unseen_start: UnseenStart,
     pub unseen_variance: f32,
+}
+
+#[inline(always)]
+fn each(value: impl Fn(usize) -> f32) -> [f32; CHANNELS] {
+    [value(0), value(1), value(2)]
+}
+
+/// What a belief says of each channel.
+#[derive(Debug, Clone, Copy)]
+pub struct Channels {
+    pub beta: [f32; CHANNELS],
+    pub tau: [f32; CHANNELS],
+    pub sigma: [f32; CHANNELS],
+}
+
+impl From<&Belief> for Channels {
+    #[inline(always)]
+    fn from(belief: &Belief) -> Self {
+        Self {
+            beta: belief.beta,
+            tau: belief.tau,
+            sigma: belief.sigma,
+        }
+    }
 }
 
 impl UpdateRules {
@@ -53,35 +77,40 @@ impl UpdateRules {
         grown.max(self.sigma_min).min(self.sigma_max)
     }
 
-    /// One channel: (beta0, tau0, sigma0) and the observation -> (beta, tau, sigma), (13) to (15).
+    /// The three channels: prior with alpha0, beta0, tau0, sigma0 and observation -> beta, tau, sigma, (13) to (15).
     #[inline(always)]
-    pub fn channel(&self, alpha0: f32, prior: (f32, f32, f32), observed: f32) -> (f32, f32, f32) {
-        let (beta0, tau0, sigma0) = prior;
-        let difference = observed - tau0;
-        let mut sigma_p = self.sigma_p(sigma0, beta0 / alpha0);
-        let mut share = 1.0 / (sigma_p + 1.0);
-        let beta = self.forgetting * beta0 + 0.5 * difference * difference * share;
+    pub fn channels(&self, alpha0: f32, prior: &Channels, observed: [f32; CHANNELS]) -> Channels {
+        let per_alpha = 1.0 / alpha0;
+        let mut sigma_p = each(|c| self.sigma_p(prior.sigma[c], prior.beta[c] * per_alpha));
+        let mut share = reciprocals(sigma_p.map(|sigma_p| sigma_p + 1.0));
+        let difference = each(|c| observed[c] - prior.tau[c]);
+        let beta = each(|c| {
+            self.forgetting * prior.beta[c] + 0.5 * difference[c] * difference[c] * share[c]
+        });
         if self.second_look {
-            sigma_p = self.sigma_p(sigma0, beta / self.alpha(alpha0));
-            share = 1.0 / (sigma_p + 1.0);
+            let per_alpha = 1.0 / self.alpha(alpha0);
+            sigma_p = each(|c| self.sigma_p(prior.sigma[c], beta[c] * per_alpha));
+            share = reciprocals(sigma_p.map(|sigma_p| sigma_p + 1.0));
         }
         // (14) as a step from tau0: no digits are lost when little moves.
-        let sigma = sigma_p * share;
-        (beta, tau0 + sigma * difference, sigma)
+        let sigma = each(|c| sigma_p[c] * share[c]);
+        Channels {
+            beta,
+            tau: each(|c| prior.tau[c] + sigma[c] * difference[c]),
+            sigma,
+        }
     }
 
     /// The whole belief of a pixel. The earlier appearance is left as it was.
     pub fn belief(&self, prior: &Belief, observed: [f32; CHANNELS]) -> Belief {
-        let mut posterior = Belief {
+        let Channels { beta, tau, sigma } = self.channels(prior.alpha, &prior.into(), observed);
+        Belief {
             alpha: self.alpha(prior.alpha),
+            beta,
+            tau,
+            sigma,
             ..*prior
-        };
-        for (c, observed) in observed.into_iter().enumerate() {
-            let channel = (prior.beta[c], prior.tau[c], prior.sigma[c]);
-            (posterior.beta[c], posterior.tau[c], posterior.sigma[c]) =
-                self.channel(prior.alpha, channel, observed);
         }
-        posterior
     }
 
     /// A pixel that no viewpoint saw, after its first observation, if it starts there.

@@ -23,7 +23,7 @@ use crate::{
         exposure::exposure_gain_on,
         interpolate::{
             merge::{MergeRules, MergeView, VIEWS_MAX},
-            prior::{self, Prior},
+            prior::{self, Prior, PriorRow},
             project::{Projector, Reach},
         },
         surprise::GammaTerm,
@@ -111,10 +111,23 @@ fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: Mesh
 pub struct Score {
     /// Nats a pixel; 0 where unseen.
     pub surprise: Vec<f32>,
-    /// The posterior, a record a pixel.
+    /// The posterior, a record a pixel; taken away when it becomes a viewpoint.
     pub posterior: Vec<Record>,
     /// The exposure gain the observation was divided by.
     pub gain: f32,
+}
+
+impl Score {
+    fn resize(&mut self, prior: &Prior, observation: &Observation) {
+        assert_eq!(
+            (observation.width, observation.height),
+            (prior.width, prior.height),
+            "the prior is recalled for the frame's camera"
+        );
+        let pixels = prior.width * prior.height;
+        self.surprise.resize(pixels, 0.0);
+        self.posterior.resize(pixels, Record::default());
+    }
 }
 
 pub struct CpuEngine {
@@ -164,9 +177,17 @@ impl CpuEngine {
     }
 
     /// Makes what follows from a mesh's depth and its records when they are stored.
-    pub fn prepare(&self, mesh: &mut Mesh, records: &[Record], coarse: &mut Coarse, cut: MeshCut) {
+    pub fn prepare(
+        &self,
+        mesh: &mut Mesh,
+        records: &[Record],
+        coarse: Option<&mut Coarse>,
+        cut: MeshCut,
+    ) {
         join(self.isa, mesh, cut);
-        reduce(self.isa, coarse, mesh, records, cut);
+        if let Some(coarse) = coarse {
+            reduce(self.isa, coarse, mesh, records, cut);
+        }
     }
 
     /// Interpolates the beliefs at a pose from at most 16 views into `prior`.
@@ -177,46 +198,13 @@ impl CpuEngine {
         world_from_camera: &Pose,
         prior: &mut Prior,
     ) {
-        let mut reaches = self
-            .reaches
-            .lock()
-            .expect("never held by a panicked caller");
-        let projectors: ArrayVec<Projector, VIEWS_MAX> = views
-            .iter()
-            .zip(reaches.iter_mut())
-            .map(|(view, reach)| {
-                Projector::new(
-                    &view.viewpoint.mesh,
-                    &view.viewpoint.world_from_camera,
-                    intrinsics,
-                    world_from_camera,
-                    reach,
-                )
-            })
-            .collect();
-        let merge_views: ArrayVec<MergeView, VIEWS_MAX> = views
-            .iter()
-            .map(|view| MergeView {
-                records: &view.viewpoint.records,
-                width: view.viewpoint.mesh.intrinsics.width,
-                height: view.viewpoint.mesh.intrinsics.height,
-                weight: view.weight,
-                fresh: view.fresh,
-            })
-            .collect();
+        let mut reaches = self.reaches();
+        let recall = Recall::new(self, views, intrinsics, world_from_camera, &mut reaches);
         prior.resize(intrinsics.width, intrinsics.height);
         let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
         let recall = |(strip, rows): (usize, &mut [f32])| {
             let (scratch, _) = &mut *self.thread_scratch();
-            scratch.recall(
-                self.isa,
-                &projectors,
-                &merge_views,
-                self.merge_rules,
-                intrinsics.width,
-                strip * STRIP_ROWS,
-                rows,
-            );
+            recall.strip(strip, rows, scratch);
         };
         let data = &mut prior.data;
         if self.is_alone() {
@@ -230,52 +218,37 @@ impl CpuEngine {
         }
     }
 
-    /// Updates the prior with an observation of the same size and measures the surprise.
-    pub fn score(&self, prior: &Prior, observation: &Observation, score: &mut Score) {
-        let (width, height) = (prior.width, prior.height);
-        assert_eq!(
-            (observation.width, observation.height),
-            (width, height),
-            "the prior is recalled for the frame's camera"
-        );
-        score.gain = if self.exposure_gain {
-            exposure_gain_on(
-                self.isa,
-                (0..height).map(|y| {
-                    let row = prior.row(y);
-                    (
-                        row.plane(prior::TAU),
-                        row.plane(prior::COVERAGE),
-                        observation.row(y)[0],
-                    )
-                }),
-            )
-        } else {
-            1.0
-        };
-        score.surprise.resize(width * height, 0.0);
-        score.posterior.resize(width * height, Record::default());
-        let inverse_gain = 1.0 / score.gain;
+    /// Updates the prior with an observation of the same size and measures the surprise. Returns how many pixels some
+    /// view saw.
+    pub fn score(&self, prior: &Prior, observation: &Observation, score: &mut Score) -> usize {
+        score.resize(prior, observation);
+        score.gain = self.gain(prior, observation);
+        let (width, inverse_gain) = (prior.width, 1.0 / score.gain);
         let strip_pixels = STRIP_ROWS * width;
         let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
             let (_, scratch) = &mut *self.thread_scratch();
-            let rows = surprise
-                .chunks_exact_mut(width)
-                .zip(posterior.chunks_exact_mut(width));
-            for (row, (surprise, posterior)) in rows.enumerate() {
-                let y = strip * STRIP_ROWS + row;
+            let rows = strip * STRIP_ROWS..prior.height;
+            let mut seen = 0;
+            for (y, (surprise, posterior)) in rows.zip(
+                surprise
+                    .chunks_exact_mut(width)
+                    .zip(posterior.chunks_exact_mut(width)),
+            ) {
                 score::score_row(
                     self.isa,
-                    prior,
-                    y,
+                    y.checked_sub(1).map(|y| prior.row(y)),
+                    prior.row(y),
+                    (y + 1 < prior.height).then(|| prior.row(y + 1)),
                     observation.row(y),
                     inverse_gain,
                     &self.score_rules,
                     scratch,
                     surprise,
                     posterior,
+                    &mut seen,
                 );
             }
+            seen
         };
         let (surprise, posterior) = (&mut score.surprise, &mut score.posterior);
         if self.is_alone() {
@@ -283,16 +256,107 @@ impl CpuEngine {
                 .chunks_mut(strip_pixels)
                 .zip(posterior.chunks_mut(strip_pixels))
                 .enumerate()
-                .for_each(update);
+                .map(update)
+                .sum()
         } else {
             self.pool.install(|| {
                 surprise
                     .par_chunks_mut(strip_pixels)
                     .zip(posterior.par_chunks_mut(strip_pixels))
                     .enumerate()
-                    .for_each(update);
-            });
+                    .map(update)
+                    .sum()
+            })
         }
+    }
+
+    /// Recalls and scores: in one pass, while the prior is at hand, unless the score depends on pixels around.
+    pub fn compare(
+        &self,
+        views: &[RecallView],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        observation: &Observation,
+        prior: &mut Prior,
+        score: &mut Score,
+    ) -> usize {
+        if self.exposure_gain || self.score_rules.looks_around() {
+            self.recall(views, intrinsics, world_from_camera, prior);
+            return self.score(prior, observation, score);
+        }
+        let mut reaches = self.reaches();
+        let recall = Recall::new(self, views, intrinsics, world_from_camera, &mut reaches);
+        let Intrinsics { width, height, .. } = *intrinsics;
+        prior.resize(width, height);
+        score.resize(prior, observation);
+        score.gain = 1.0;
+        type Strip<'a> = ((&'a mut [f32], &'a mut [f32]), &'a mut [Record]);
+        let both = |(strip, ((rows, surprise), posterior)): (usize, Strip)| {
+            let (recall_scratch, scratch) = &mut *self.thread_scratch();
+            recall.strip(strip, rows, recall_scratch);
+            let mut seen = 0;
+            for (row, (surprise, posterior)) in surprise
+                .chunks_exact_mut(width)
+                .zip(posterior.chunks_exact_mut(width))
+                .enumerate()
+            {
+                score::score_row(
+                    self.isa,
+                    None,
+                    PriorRow::of(rows, row, width),
+                    None,
+                    observation.row(strip * STRIP_ROWS + row),
+                    1.0,
+                    &self.score_rules,
+                    scratch,
+                    surprise,
+                    posterior,
+                    &mut seen,
+                );
+            }
+            seen
+        };
+        let strip_pixels = STRIP_ROWS * width;
+        let (data, surprise) = (&mut prior.data, &mut score.surprise);
+        let posterior = &mut score.posterior;
+        if self.is_alone() {
+            data.chunks_mut(strip_pixels * prior::PLANES)
+                .zip(surprise.chunks_mut(strip_pixels))
+                .zip(posterior.chunks_mut(strip_pixels))
+                .enumerate()
+                .map(both)
+                .sum()
+        } else {
+            self.pool.install(|| {
+                data.par_chunks_mut(strip_pixels * prior::PLANES)
+                    .zip(surprise.par_chunks_mut(strip_pixels))
+                    .zip(posterior.par_chunks_mut(strip_pixels))
+                    .enumerate()
+                    .map(both)
+                    .sum()
+            })
+        }
+    }
+
+    fn gain(&self, prior: &Prior, observation: &Observation) -> f32 {
+        if !self.exposure_gain {
+            return 1.0;
+        }
+        let rows = (0..prior.height).map(|y| {
+            let row = prior.row(y);
+            (
+                row.plane(prior::TAU),
+                row.plane(prior::COVERAGE),
+                observation.row(y)[0],
+            )
+        });
+        exposure_gain_on(self.isa, rows)
+    }
+
+    fn reaches(&self) -> std::sync::MutexGuard<'_, [Reach; VIEWS_MAX]> {
+        self.reaches
+            .lock()
+            .expect("never held by a panicked caller")
     }
 
     /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
@@ -306,5 +370,64 @@ impl CpuEngine {
         self.scratch[thread]
             .lock()
             .expect("a thread that panicked ends the process")
+    }
+}
+
+/// Views on their way into a prior.
+struct Recall<'a> {
+    engine: &'a CpuEngine,
+    projectors: ArrayVec<Projector<'a>, VIEWS_MAX>,
+    views: ArrayVec<MergeView<'a>, VIEWS_MAX>,
+    width: usize,
+}
+
+impl<'a> Recall<'a> {
+    fn new(
+        engine: &'a CpuEngine,
+        views: &[RecallView<'a>],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        reaches: &'a mut [Reach; VIEWS_MAX],
+    ) -> Self {
+        Self {
+            engine,
+            projectors: views
+                .iter()
+                .zip(reaches)
+                .map(|(view, reach)| {
+                    Projector::new(
+                        &view.viewpoint.mesh,
+                        &view.viewpoint.world_from_camera,
+                        intrinsics,
+                        world_from_camera,
+                        reach,
+                    )
+                })
+                .collect(),
+            views: views
+                .iter()
+                .map(|view| MergeView {
+                    records: &view.viewpoint.records,
+                    width: view.viewpoint.mesh.intrinsics.width,
+                    height: view.viewpoint.mesh.intrinsics.height,
+                    weight: view.weight,
+                    fresh: view.fresh,
+                })
+                .collect(),
+            width: intrinsics.width,
+        }
+    }
+
+    /// The rows of a strip of the prior.
+    fn strip(&self, strip: usize, rows: &mut [f32], scratch: &mut StripScratch) {
+        scratch.recall(
+            self.engine.isa,
+            &self.projectors,
+            &self.views,
+            self.engine.merge_rules,
+            self.width,
+            strip * STRIP_ROWS,
+            rows,
+        );
     }
 }

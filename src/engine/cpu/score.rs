@@ -4,14 +4,17 @@
 use crate::{
     config::UnseenStart,
     isa::for_each_isa,
-    lanes::{LANES, Lanes, bits, members, prefetch},
+    lanes::{LANES, Lanes, Portable, Transpose, bits, members, prefetch},
     model::belief::{Belief, BeliefLanes, CHANNELS, Record},
     stages::{
-        interpolate::prior::{self, Prior, PriorRow},
-        surprise::{GammaTerm, P2_MIN, edge_gradient_row, joint_surprise, plain_terms, total},
-        update::UpdateRules,
+        interpolate::prior::{self, PriorRow},
+        surprise::{GammaTerm, P2_MIN, divergence, edge_gradient_row, joint_surprise},
+        update::{Channels, UpdateRules},
     },
 };
+
+#[cfg(target_arch = "x86_64")]
+use crate::lanes::Avx;
 
 /// Variance that a new or exchanged appearance keeps, grey levels squared.
 const CHANGED_VARIANCE: (f32, f32) = (60.0, 400.0);
@@ -28,6 +31,13 @@ pub struct ScoreRules {
     pub surprise_threshold: f32,
 }
 
+impl ScoreRules {
+    /// Whether a pixel's score depends on those around it.
+    pub fn looks_around(&self) -> bool {
+        self.edge_variance_px > 0.0
+    }
+}
+
 /// Working memory of one thread.
 #[derive(Default)]
 pub struct ScoreScratch {
@@ -35,37 +45,39 @@ pub struct ScoreScratch {
 }
 
 for_each_isa! {
-    /// Row `y` of the image: surprise in nats and the posterior's records.
+    /// A row of the image, between its neighbours: surprise in nats and the posterior's records. Adds to `seen` how many
+    /// pixels some view saw.
     pub fn score_row(
-        prior: &Prior,
-        y: usize,
+        above: Option<PriorRow<'_>>,
+        row: PriorRow<'_>,
+        below: Option<PriorRow<'_>>,
         observed: [&[f32]; CHANNELS],
         inverse_gain: f32,
         rules: &ScoreRules,
         scratch: &mut ScoreScratch,
         surprise: &mut [f32],
         posterior: &mut [Record],
-    ) = score_row_kernel;
+        seen: &mut usize,
+    ) = score_row_kernel::<Portable>, avx score_row_kernel::<Avx>;
 }
 
 #[inline(always)]
 #[allow(clippy::too_many_arguments)]
-fn score_row_kernel(
-    prior: &Prior,
-    y: usize,
+fn score_row_kernel<T: Transpose>(
+    above: Option<PriorRow>,
+    row: PriorRow,
+    below: Option<PriorRow>,
     observed: [&[f32]; CHANNELS],
     inverse_gain: f32,
     rules: &ScoreRules,
     scratch: &mut ScoreScratch,
     surprise: &mut [f32],
     posterior: &mut [Record],
+    seen: &mut usize,
 ) {
-    let width = prior.width;
-    let row = prior.row(y);
-    let widened = rules.edge_variance_px > 0.0;
+    let width = row.width;
+    let widened = rules.looks_around();
     if widened {
-        let above = y.checked_sub(1).map(|y| prior.row(y));
-        let below = (y + 1 < prior.height).then(|| prior.row(y + 1));
         let around = |plane: usize| {
             (
                 above.map(|row| row.plane(plane)),
@@ -97,14 +109,16 @@ fn score_row_kernel(
         let surprise = &mut surprise[start..start + count];
         let posterior = &mut posterior[start..start + count];
         match posterior.first_chunk_mut::<LANES>() {
-            Some(records) => Record::pack_lanes(&scored.posterior, records),
+            Some(records) => Record::pack_lanes::<T>(&scored.posterior, records),
             None => {
                 let mut records = [Record::default(); LANES];
-                Record::pack_lanes(&scored.posterior, &mut records);
+                Record::pack_lanes::<T>(&scored.posterior, &mut records);
                 posterior.copy_from_slice(&records[..count]);
             }
         }
         surprise.copy_from_slice(&scored.surprise[..count]);
+        let covered = bits(|lane| (lane < count) & (step.coverage[lane] > 0.0));
+        *seen += covered.count_ones() as usize;
         for lane in members(two).take_while(|&lane| lane < count) {
             (surprise[lane], posterior[lane]) =
                 two_appearances(&step, &scored, lane, row.belief(start + lane), rules);
@@ -185,52 +199,43 @@ impl Step {
             widened_beta: self.beta,
             posterior: BeliefLanes::default(),
         };
-        let mut plain = [0.0; LANES];
-        let mut before = [[1.0; LANES]; 2];
-        let mut after = [[1.0; LANES]; 2];
-        for c in 0..CHANNELS {
-            for lane in 0..LANES {
-                let alpha0 = self.alpha[lane];
-                let (tau0, sigma0) = (self.tau[c][lane], self.sigma[c][lane]);
-                let observed = self.observed[c][lane];
-                let beta0 = self.beta[c][lane];
-                let (beta, tau, sigma) =
-                    rules
-                        .update
-                        .channel(alpha0, (beta0, tau0, sigma0), observed);
-                scored.posterior.beta[c][lane] = beta;
-                scored.posterior.tau[c][lane] = tau;
-                scored.posterior.sigma[c][lane] = sigma;
-                let (beta0, beta, sigma) = if WIDENED {
-                    let widened = beta0 + alpha0 * rules.edge_variance_px * self.edge[c][lane];
-                    scored.widened_beta[c][lane] = widened;
-                    let (beta, _, sigma) =
-                        rules
-                            .update
-                            .channel(alpha0, (widened, tau0, sigma0), observed);
-                    (widened, beta, sigma)
-                } else {
-                    (beta0, beta, sigma)
-                };
-                plain[lane] += plain_terms(
-                    rules.update.alpha(alpha0),
-                    (beta0, sigma0),
-                    (beta, sigma),
-                    observed - tau0,
-                );
-                before[0][lane] *= beta0;
-                before[1][lane] *= sigma0;
-                after[0][lane] *= beta;
-                after[1][lane] *= sigma;
-            }
-        }
+        let posterior = &mut scored.posterior;
         for lane in 0..LANES {
-            scored.posterior.alpha[lane] = rules.update.alpha(self.alpha[lane]);
-            scored.surprise[lane] = total(
-                self.alpha[lane],
-                plain[lane],
-                (before[0][lane], before[1][lane]),
-                (after[0][lane], after[1][lane]),
+            let at =
+                |planes: &[Lanes; CHANNELS]| [planes[0][lane], planes[1][lane], planes[2][lane]];
+            let alpha0 = self.alpha[lane];
+            let alpha = rules.update.alpha(alpha0);
+            let prior = Channels {
+                beta: at(&self.beta),
+                tau: at(&self.tau),
+                sigma: at(&self.sigma),
+            };
+            let observed = at(&self.observed);
+            let updated = rules.update.channels(alpha0, &prior, observed);
+            posterior.alpha[lane] = alpha;
+            for c in 0..CHANNELS {
+                posterior.beta[c][lane] = updated.beta[c];
+                posterior.tau[c][lane] = updated.tau[c];
+                posterior.sigma[c][lane] = updated.sigma[c];
+            }
+            let (prior, updated) = if WIDENED {
+                let mut prior = prior;
+                for c in 0..CHANNELS {
+                    prior.beta[c] += alpha0 * rules.edge_variance_px * self.edge[c][lane];
+                    scored.widened_beta[c][lane] = prior.beta[c];
+                }
+                (prior, rules.update.channels(alpha0, &prior, observed))
+            } else {
+                (prior, updated)
+            };
+            scored.surprise[lane] = divergence(
+                (alpha0, &prior),
+                (alpha, &updated),
+                [
+                    observed[0] - prior.tau[0],
+                    observed[1] - prior.tau[1],
+                    observed[2] - prior.tau[2],
+                ],
                 &rules.gamma,
             );
         }

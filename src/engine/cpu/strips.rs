@@ -6,7 +6,7 @@ use crate::{
         gather::Portable,
         merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
         prior::PLANES,
-        project::{ProjectScratch, Projector, Sample, draw},
+        project::{ProjectScratch, Projector, Sample, draw, map_size},
     },
 };
 
@@ -45,10 +45,10 @@ impl StripScratch {
         rows: &mut [f32],
     ) {
         let height = rows.len() / (width * PLANES);
-        let map_size = width * height;
+        let map_size = map_size(width * height);
         self.maps.clear();
         self.maps.resize(map_size * views.len(), 0);
-        if map_size == 0 {
+        if rows.is_empty() {
             return;
         }
         for (projector, map) in projectors.iter().zip(self.maps.chunks_exact_mut(map_size)) {

@@ -5,11 +5,11 @@
 //! end. Two twins give the same bits: one with 256-bit registers and one for any processor.
 
 use crate::{
-    lanes::{LANES, Lanes, members, prefetch},
+    lanes::{self, LANES, Lanes, Transpose, members, prefetch},
     model::belief::{LEVEL_SCALE, Record, f32_from_f16},
 };
 
-use super::project::{POSITION_BITS, POSITION_MASK, STEPS, Sample, sample_inverse_depth};
+use super::project::{STEPS, Sample, split};
 
 /// Steps of a source pixel, as integers.
 const WHOLE: u32 = STEPS as u32;
@@ -41,36 +41,43 @@ impl Source {
         inverse_depth: [0.0; LANES],
     };
 
-    /// One pixel, of a view of `width * height` pixels, at least 2x2.
+    /// Sixteen pixels, of a view of `width * height` pixels, at least 2x2.
     #[inline(always)]
-    pub fn locate(&mut self, lane: usize, sample: Sample, width: u32, height: u32) {
-        let u = (sample & POSITION_MASK) as u32;
-        let v = ((sample >> POSITION_BITS) & POSITION_MASK) as u32;
-        // A sample on the last column or row belongs to the quad before it.
-        let column = (u / WHOLE).min(width - 2);
-        let row = (v / WHOLE).min(height - 2);
-        let right = (u - column * WHOLE).min(WHOLE);
-        let down = (v - row * WHOLE).min(WHOLE);
-        let upper_left = row * width + column;
-        let in_lower_right = right + down > WHOLE;
-        let corner = upper_left + if in_lower_right { width + 1 } else { 0 };
-        let w = [
-            if in_lower_right {
-                right + down - WHOLE
-            } else {
-                WHOLE - (right + down)
-            },
-            if in_lower_right { WHOLE - down } else { right },
-            if in_lower_right { WHOLE - right } else { down },
-        ];
-        self.upper_left[lane] = upper_left;
-        self.corner[lane] = corner;
-        self.corner_and_right[lane] = w[0] | (w[1] << 16);
-        self.lower_left[lane] = w[2];
-        for (weights, w) in self.weights.iter_mut().zip(w) {
-            weights[lane] = w as i32 as f32 * (1.0 / STEPS);
+    pub fn locate(&mut self, samples: &[Sample; LANES], width: u32, height: u32) {
+        // In halves first, so that all that follows is done sixteen at a time.
+        let (mut lows, mut highs) = ([0u32; LANES], [0u32; LANES]);
+        for lane in 0..LANES {
+            lows[lane] = samples[lane] as u32;
+            highs[lane] = (samples[lane] >> 32) as u32;
         }
-        self.inverse_depth[lane] = sample_inverse_depth(sample);
+        for lane in 0..LANES {
+            let (u, v, inverse_depth) = split(lows[lane], highs[lane]);
+            // A sample on the last column or row belongs to the quad before it.
+            let column = (u / WHOLE).min(width - 2);
+            let row = (v / WHOLE).min(height - 2);
+            let right = (u - column * WHOLE).min(WHOLE);
+            let down = (v - row * WHOLE).min(WHOLE);
+            let upper_left = row * width + column;
+            let in_lower_right = right + down > WHOLE;
+            let corner = upper_left + if in_lower_right { width + 1 } else { 0 };
+            let w = [
+                if in_lower_right {
+                    right + down - WHOLE
+                } else {
+                    WHOLE - (right + down)
+                },
+                if in_lower_right { WHOLE - down } else { right },
+                if in_lower_right { WHOLE - right } else { down },
+            ];
+            self.upper_left[lane] = upper_left;
+            self.corner[lane] = corner;
+            self.corner_and_right[lane] = w[0] | (w[1] << 16);
+            self.lower_left[lane] = w[2];
+            for (weights, w) in self.weights.iter_mut().zip(w) {
+                weights[lane] = w as i32 as f32 * (1.0 / STEPS);
+            }
+            self.inverse_depth[lane] = inverse_depth;
+        }
     }
 
     /// Asks for what the row below will need: of its three records two are near those of this row.
@@ -128,11 +135,19 @@ impl Sums {
 /// The sums of one pixel, interleaved.
 type Tile = [[f32; 8]; LANES];
 
+#[inline(always)]
+fn planes<T: Transpose>(tile: &Tile, planes: &mut [Lanes; 8]) {
+    T::planes(bytemuck::cast_ref(tile), bytemuck::cast_mut(planes));
+}
+
 /// The two twins.
 pub trait Gather {
     /// Sums the views in `seen`, a bit mask a pixel; pixels without any get zeros. When `COMPARING`, views are compared
     /// (squares and ranges); otherwise they all must weigh 1, and `first` is 0.
-    fn sum<const COMPARING: bool>(
+    ///
+    /// # Safety
+    /// `seen` names views only, each with a source that was located in it, and its records are there.
+    unsafe fn sum<const COMPARING: bool>(
         views: &[GatherView],
         sources: &[Source],
         seen: &[u32; LANES],
@@ -145,7 +160,7 @@ pub struct Portable;
 
 impl Gather for Portable {
     #[inline(always)]
-    fn sum<const COMPARING: bool>(
+    unsafe fn sum<const COMPARING: bool>(
         views: &[GatherView],
         sources: &[Source],
         seen: &[u32; LANES],
@@ -208,11 +223,11 @@ impl Gather for Portable {
                 }
             }
         }
-        let planes = |tile: &Tile| std::array::from_fn(|k| std::array::from_fn(|l| tile[l][k]));
-        sums.spread = planes(&spreads);
-        sums.level = planes(&levels);
+        use lanes::Portable;
+        planes::<Portable>(&spreads, &mut sums.spread);
+        planes::<Portable>(&levels, &mut sums.level);
         if COMPARING {
-            sums.range = planes(&ranges);
+            planes::<Portable>(&ranges, &mut sums.range);
         }
     }
 }
@@ -226,27 +241,29 @@ mod x86 {
 
     use crate::lanes::members;
 
-    use super::{Gather, GatherView, LANES, Lanes, Source, Sums, Tile};
+    use super::{Gather, GatherView, LANES, Source, Sums, Tile, planes};
 
     /// With AVX2 and F16C.
     pub struct Avx;
 
     impl Gather for Avx {
         #[inline(always)]
-        fn sum<const COMPARING: bool>(
+        unsafe fn sum<const COMPARING: bool>(
             views: &[GatherView],
             sources: &[Source],
             seen: &[u32; LANES],
             sums: &mut Sums,
         ) {
-            // SAFETY: `Avx` is only named in kernels that are compiled for AVX2 and F16C.
+            // SAFETY: `Avx` is only named in kernels that are compiled for AVX2 and F16C; the rest is demanded here too.
             unsafe { sum::<COMPARING>(views, sources, seen, sums) }
         }
     }
 
+    /// # Safety
+    /// `seen` names views only, each with a source that was located in it, and its records are there.
     #[inline]
     #[target_feature(enable = "avx2,f16c")]
-    fn sum<const COMPARING: bool>(
+    unsafe fn sum<const COMPARING: bool>(
         views: &[GatherView],
         sources: &[Source],
         seen: &[u32; LANES],
@@ -266,15 +283,21 @@ mod x86 {
             let mut high = _mm_set1_ps(f32::NEG_INFINITY);
             let mut is_first = true;
             for index in members(seen[lane]) {
-                let (source, view) = (&sources[index], &views[index]);
-                let records = source.records(lane, view);
-                // SAFETY: a record is 32 readable bytes: eight f16, then eight i16.
-                let halves = records.map(|record| unsafe {
-                    (
-                        _mm_loadu_si128(record.spread.as_ptr().cast()),
-                        _mm_loadu_si128(record.level.as_ptr().cast()),
-                    )
-                });
+                // SAFETY: `seen` says which of the views, and there is a source for each.
+                let (source, view) =
+                    unsafe { (sources.get_unchecked(index), views.get_unchecked(index)) };
+                // SAFETY: sources lie inside their view, which has its records, as `sum` demands; a record is 32 readable
+                // bytes: eight f16, then eight i16.
+                let halves = unsafe {
+                    let upper_left = view.records.as_ptr().add(source.upper_left[lane] as usize);
+                    let corner = view.records.as_ptr().add(source.corner[lane] as usize);
+                    [corner, upper_left.add(1), upper_left.add(view.width)].map(|record| {
+                        (
+                            _mm_load_si128(record.cast()),
+                            _mm_load_si128(record.cast::<__m128i>().add(1)),
+                        )
+                    })
+                };
                 for ((stored, _), weights) in halves.into_iter().zip(&source.weights) {
                     let w = if COMPARING {
                         weights[lane] * view.weight
@@ -323,43 +346,11 @@ mod x86 {
                 }
             }
         }
-        planes(&spreads, &mut sums.spread);
-        planes(&levels, &mut sums.level);
+        use crate::lanes::Avx;
+        planes::<Avx>(&spreads, &mut sums.spread);
+        planes::<Avx>(&levels, &mut sums.level);
         if COMPARING {
-            planes(&ranges, &mut sums.range);
-        }
-    }
-
-    /// Transposes sixteen pixels of eight values.
-    #[inline]
-    #[target_feature(enable = "avx2")]
-    fn planes(tile: &Tile, planes: &mut [Lanes; 8]) {
-        for half in 0..2 {
-            // SAFETY: eight f32 each.
-            let row = |index: usize| unsafe { _mm256_loadu_ps(tile[8 * half + index].as_ptr()) };
-            let pairs = |a: usize, b: usize| {
-                (
-                    _mm256_unpacklo_ps(row(a), row(b)),
-                    _mm256_unpackhi_ps(row(a), row(b)),
-                )
-            };
-            let (a0, a1) = pairs(0, 1);
-            let (b0, b1) = pairs(2, 3);
-            let (c0, c1) = pairs(4, 5);
-            let (d0, d1) = pairs(6, 7);
-            let low = |a, b| _mm256_shuffle_ps::<0b01_00_01_00>(a, b);
-            let high = |a, b| _mm256_shuffle_ps::<0b11_10_11_10>(a, b);
-            let left = [low(a0, b0), high(a0, b0), low(a1, b1), high(a1, b1)];
-            let right = [low(c0, d0), high(c0, d0), low(c1, d1), high(c1, d1)];
-            for k in 0..4 {
-                let lower = _mm256_permute2f128_ps::<0x20>(left[k], right[k]);
-                let upper = _mm256_permute2f128_ps::<0x31>(left[k], right[k]);
-                // SAFETY: a plane holds sixteen f32.
-                unsafe {
-                    _mm256_storeu_ps(planes[k].as_mut_ptr().add(8 * half), lower);
-                    _mm256_storeu_ps(planes[k + 4].as_mut_ptr().add(8 * half), upper);
-                }
-            }
+            planes::<Avx>(&ranges, &mut sums.range);
         }
     }
 }

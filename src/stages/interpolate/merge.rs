@@ -6,7 +6,7 @@
 //! appearance. Each of these is a switch.
 
 use crate::{
-    lanes::{LANES, Lanes, bits, members, prefetch},
+    lanes::{LANES, Lanes, bits, members, prefetch, reciprocal},
     model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
 };
 
@@ -115,6 +115,13 @@ pub fn merge_row<G: Gather>(
     row: &mut [f32],
 ) {
     assert!(views.len() <= VIEWS_MAX && views.len() == maps.len());
+    for view in views {
+        assert_eq!(
+            view.records.len(),
+            view.width * view.height,
+            "a record a pixel"
+        );
+    }
     // A smaller view has no triangle.
     let has_triangles = |view: &MergeView| view.width >= 2 && view.height >= 2;
     let comparing = rules.compares() || views.iter().any(|view| view.weight != 1.0);
@@ -148,9 +155,10 @@ pub fn merge_row<G: Gather>(
                     }
                 };
                 let source = &mut sources[index];
-                for lane in 0..LANES {
-                    source.locate(lane, samples[lane], view.width as u32, view.height as u32);
-                    step.see(lane, index, view.weight, source.inverse_depth[lane]);
+                source.locate(samples, view.width as u32, view.height as u32);
+                step.see(index, view.weight, &source.inverse_depth);
+                if rules.depth_vote_tolerance.is_some() {
+                    step.range(&source.inverse_depth);
                 }
                 source.prefetch_below(&gather_views[index]);
             }
@@ -163,7 +171,8 @@ pub fn merge_row<G: Gather>(
             step.seen[lane] = 0;
         }
         if comparing {
-            G::sum::<true>(gather_views, &sources, &step.seen, &mut sums);
+            // SAFETY: only views that have triangles are seen, all located above; their records were counted.
+            unsafe { G::sum::<true>(gather_views, &sources, &step.seen, &mut sums) };
             let mut merged = step.finish(&sums, true, rules.view_variance);
             if rules.colour_vote {
                 apart |= merged.colours_apart(&sums);
@@ -173,7 +182,8 @@ pub fn merge_row<G: Gather>(
             }
             merged.write(row, width, start, count);
         } else {
-            G::sum::<false>(gather_views, &sources, &step.seen, &mut sums);
+            // SAFETY: as above.
+            unsafe { G::sum::<false>(gather_views, &sources, &step.seen, &mut sums) };
             step.finish(&sums, false, false)
                 .write(row, width, start, count);
         }
@@ -218,21 +228,32 @@ struct Step {
 
 impl Step {
     #[inline(always)]
-    fn see(&mut self, lane: usize, index: usize, weight: f32, inverse_depth: f32) {
-        let seen = inverse_depth > 0.0;
-        self.seen[lane] |= u32::from(seen) << index;
-        self.coverage[lane] += if seen { 1.0 } else { 0.0 };
-        self.weight[lane] += if seen { weight } else { 0.0 };
-        self.weighted_depth_m[lane] += if seen { weight / inverse_depth } else { 0.0 };
-        let nearest = self.nearest[lane];
-        self.nearest[lane] = if inverse_depth > nearest {
-            inverse_depth
-        } else {
-            nearest
-        };
-        let farthest = self.farthest[lane];
-        let farther = seen & ((inverse_depth < farthest) | (farthest == 0.0));
-        self.farthest[lane] = if farther { inverse_depth } else { farthest };
+    fn see(&mut self, index: usize, weight: f32, inverse_depth: &Lanes) {
+        for lane in 0..LANES {
+            let inverse = inverse_depth[lane];
+            let seen = inverse > 0.0;
+            // Of any positive number where unseen, so that nothing is infinite.
+            let positive = if seen { inverse } else { 1.0 };
+            let near = reciprocal(positive);
+            let depth_m = near * (2.0 - positive * near);
+            self.seen[lane] |= u32::from(seen) << index;
+            self.coverage[lane] += if seen { 1.0 } else { 0.0 };
+            self.weight[lane] += if seen { weight } else { 0.0 };
+            self.weighted_depth_m[lane] += if seen { weight * depth_m } else { 0.0 };
+        }
+    }
+
+    /// Nearest and farthest are needed for the vote on depth alone.
+    #[inline(always)]
+    fn range(&mut self, inverse_depth: &Lanes) {
+        for lane in 0..LANES {
+            let inverse = inverse_depth[lane];
+            let nearest = self.nearest[lane];
+            self.nearest[lane] = if inverse > nearest { inverse } else { nearest };
+            let farthest = self.farthest[lane];
+            let farther = (inverse > 0.0) & ((inverse < farthest) | (farthest == 0.0));
+            self.farthest[lane] = if farther { inverse } else { farthest };
+        }
     }
 
     /// Pixels, a bit mask, whose views must vote on depth: the farthest is not within the tolerance of the nearest.

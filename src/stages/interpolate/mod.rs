@@ -1,12 +1,15 @@
 //! The prior at a pose where no viewpoint stands (section III-D).
 //!
 //! Viewpoints and a camera -> one interpolated belief a pixel, with depth (metres) and coverage. In two passes: each
-//! mesh is projected into a map of source positions ([`project`]), then records are gathered and merged ([`merge`]).
+//! mesh is projected into a map of source positions ([`project`]; what is flat by [`patch`]), then records are gathered
+//! and merged ([`merge`]).
 //! The paper averages all covering views; the votes are ours and switchable.
 
 pub mod gather;
 
 pub mod merge;
+
+pub mod patch;
 
 pub mod prior;
 

@@ -36,11 +36,7 @@ impl Prior {
     }
 
     pub fn row(&self, y: usize) -> PriorRow<'_> {
-        let stride = self.width * PLANES;
-        PriorRow {
-            width: self.width,
-            data: &self.data[y * stride..][..stride],
-        }
+        PriorRow::of(&self.data, y, self.width)
     }
 
     /// One plane of the whole image, row by row.
@@ -60,6 +56,15 @@ pub struct PriorRow<'a> {
 }
 
 impl<'a> PriorRow<'a> {
+    /// Row `y` of such rows.
+    pub fn of(data: &'a [f32], y: usize, width: usize) -> Self {
+        let stride = width * PLANES;
+        Self {
+            width,
+            data: &data[y * stride..][..stride],
+        }
+    }
+
     #[inline(always)]
     pub fn plane(&self, plane: usize) -> &'a [f32] {
         &self.data[plane * self.width..][..self.width]

@@ -11,9 +11,12 @@ use crate::isa::for_each_isa;
 use crate::lanes::{LANES, Lanes, reciprocal};
 use crate::model::{
     camera::Intrinsics,
+    patch::PATCH_ROWS,
     pose::Pose,
     viewpoint::{LOWER_RIGHT, Mesh, UPPER_LEFT},
 };
+
+use super::patch::{Drawable, FlatPatch};
 
 /// A pixel of the map: `inverse depth (24 bit) | v (20 bit) | u (20 bit)`; 0 = the viewpoint does not see it.
 pub type Sample = u64;
@@ -25,13 +28,18 @@ pub const POSITION_MASK: u64 = (1 << POSITION_BITS) - 1;
 /// The largest width and height that u and v can address.
 pub const SIDE_MAX: usize = 1 << (POSITION_BITS - 7);
 /// Of a positive `f32` the sign is 0 and 7 bits of the mantissa are left out: depth to 1.5e-5 of itself.
-const INVERSE_DEPTH_SHIFT: u32 = 7;
+pub const INVERSE_DEPTH_SHIFT: u32 = 7;
 /// Surfaces nearer than this to the target camera are dropped, metres: their projection blows up.
-const NEAR_M: f32 = 0.02;
+pub const NEAR_M: f32 = 0.02;
 
 /// 2^23: adding it leaves a non-negative number's nearest integer in the mantissa.
-const INTEGER: f32 = 8_388_608.0;
-const INTEGER_MASK: u32 = (1 << 23) - 1;
+pub const INTEGER: f32 = 8_388_608.0;
+pub const INTEGER_MASK: u32 = (1 << 23) - 1;
+
+/// Samples of the map of a strip of so many pixels: steps of sixteen may reach beyond the last.
+pub fn map_size(pixels: usize) -> usize {
+    pixels + LANES
+}
 
 #[inline(always)]
 fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
@@ -40,6 +48,16 @@ fn pack(inverse_depth: f32, u: f32, v: f32) -> Sample {
     (u64::from(inverse_depth.to_bits() >> INVERSE_DEPTH_SHIFT) << (2 * POSITION_BITS))
         | (steps(v) << POSITION_BITS)
         | steps(u)
+}
+
+/// The lower and the upper half of a sample -> u and v in steps, 1/depth.
+#[inline(always)]
+pub fn split(low: u32, high: u32) -> (u32, u32, f32) {
+    const OF_V: u32 = 2 * POSITION_BITS - 32;
+    let u = low & POSITION_MASK as u32;
+    let v = (low >> POSITION_BITS) | ((high << (32 - OF_V)) >> (POSITION_BITS - OF_V));
+    let inverse_depth = f32::from_bits((high >> OF_V) << INVERSE_DEPTH_SHIFT);
+    (u, v, inverse_depth)
 }
 
 /// 1/depth in the target camera, 1/metres.
@@ -87,6 +105,10 @@ pub struct Reach {
     high: Vec<f32>,
     /// Of each row's blocks together.
     rows: Vec<(f32, f32)>,
+    /// The patches that are drawn as such.
+    flat: Vec<FlatPatch>,
+    /// Blocks of [`PATCH_ROWS`] rows that need no triangles.
+    done: Vec<bool>,
 }
 
 /// One row of projected vertices.
@@ -126,6 +148,25 @@ pub fn homography(
 }
 
 impl Reach {
+    /// Finds which patches are drawn as such.
+    fn flatten(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
+        let blocks = mesh.blocks();
+        self.flat.clear();
+        self.flat.reserve(mesh.patches.capacity());
+        self.done.clear();
+        self.done
+            .resize(blocks * mesh.intrinsics.height.div_ceil(PATCH_ROWS), false);
+        for patch in &mesh.patches {
+            match FlatPatch::new(patch, &mesh.intrinsics, h_matrix, h_offset) {
+                Drawable::ByTriangles => continue,
+                Drawable::Hidden => {}
+                Drawable::Flat(flat) => self.flat.push(flat),
+            }
+            let first = patch.row / PATCH_ROWS * blocks + patch.column / LANES;
+            self.done[first..first + patch.columns.div_ceil(LANES)].fill(true);
+        }
+    }
+
     /// Target y is monotonous in column and in depth, so the corners of a block's ranges bound it.
     fn compute(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
         let Intrinsics { width, height, .. } = mesh.intrinsics;
@@ -144,7 +185,12 @@ impl Reach {
             let farthest = &mesh.block_farthest_m[range.clone()];
             let lows = &mut self.low[range.clone()];
             let highs = &mut self.high[range];
+            let [above, below] = [row.saturating_sub(1), row.min(height.saturating_sub(2))]
+                .map(|quads| &self.done[quads / PATCH_ROWS * blocks..][..blocks]);
             for block in 0..blocks {
+                if above[block] & below[block] {
+                    continue;
+                }
                 let (mut low, mut high, mut least_z) =
                     (f32::INFINITY, f32::NEG_INFINITY, f32::INFINITY);
                 let first = (block * LANES) as f32;
@@ -181,9 +227,12 @@ impl Reach {
         // A quad lies between two rows of vertices.
         for row in 0..height.saturating_sub(1) {
             let mut hull = (f32::INFINITY, f32::NEG_INFINITY);
-            for at in row * blocks..(row + 1) * blocks {
-                self.low[at] = min(self.low[at], self.low[at + blocks]);
-                self.high[at] = max(self.high[at], self.high[at + blocks]);
+            let done = &self.done[row / PATCH_ROWS * blocks..][..blocks];
+            for (at, &done) in (row * blocks..(row + 1) * blocks).zip(done) {
+                let low = min(self.low[at], self.low[at + blocks]);
+                let high = max(self.high[at], self.high[at + blocks]);
+                self.low[at] = if done { f32::INFINITY } else { low };
+                self.high[at] = if done { f32::NEG_INFINITY } else { high };
                 hull = (min(hull.0, self.low[at]), max(hull.1, self.high[at]));
             }
             self.rows.push(hull);
@@ -201,6 +250,7 @@ impl<'a> Projector<'a> {
         reach: &'a mut Reach,
     ) -> Self {
         let (h_matrix, h_offset) = homography(mesh, world_from_view, target, world_from_target);
+        reach.flatten(mesh, &h_matrix, &h_offset);
         reach.compute(mesh, &h_matrix, &h_offset);
         Self {
             mesh,
@@ -210,7 +260,7 @@ impl<'a> Projector<'a> {
         }
     }
 
-    /// Draws what falls into rows `strip` of the target. `map` is that strip, `strip.len() * width` samples, and keeps
+    /// Draws what falls into rows `strip` of the target. `map` is that strip, as large as [`map_size`] says, and keeps
     /// the nearer of what it holds and what is drawn.
     #[inline(always)]
     pub fn draw(
@@ -220,12 +270,24 @@ impl<'a> Projector<'a> {
         map: &mut [Sample],
         scratch: &mut ProjectScratch,
     ) {
-        assert_eq!(map.len(), width * strip.len(), "the map is the strip");
+        let pixels = width * strip.len();
+        assert_eq!(map.len(), map_size(pixels), "the map is the strip");
+        for flat in &self.reach.flat {
+            // As floats, because both may lie far outside.
+            let first = flat.low.max(strip.start as f32).ceil();
+            let last = flat.high.min(strip.end as f32 - 1.0);
+            if first <= last {
+                for y in first as usize..=last as usize {
+                    flat.draw_row(y, width, &mut map[(y - strip.start) * width..]);
+                }
+            }
+        }
         let columns = self.mesh.intrinsics.width;
         let mut target = Target { width, strip, map };
         // The row and columns that `lower` holds.
         let mut held = (usize::MAX, 0..0);
         let mut next = None;
+        let (mut block, mut batch) = (Block::NONE, Batch::NONE);
         for row in 0..self.reach.rows.len() {
             let touched = match next.take() {
                 Some(touched) => touched,
@@ -258,8 +320,11 @@ impl<'a> Projector<'a> {
                 lower: &scratch.lower,
                 cut,
             };
+            let low = &self.reach.low[row * self.mesh.blocks()..];
             for column in touched.step_by(LANES) {
-                quads.draw_block(column, &mut target);
+                if low[column / LANES] < f32::INFINITY {
+                    quads.draw_block(column, &mut target, &mut block, &mut batch);
+                }
             }
         }
     }
@@ -306,9 +371,10 @@ impl<'a> Projector<'a> {
         let xs = &mut vertices.x[touched.clone()];
         let ys = &mut vertices.y[touched.clone()];
         let inverse_depths = &mut vertices.inverse_depth[touched.clone()];
+        let first = touched.start as i32;
         for column in 0..depth_m.len() {
             let z = depth_m[column];
-            let at = (touched.start + column) as f32;
+            let at = (first + column as i32) as f32;
             let q_x = z * (m[(0, 0)] * at + start.x) + offset.x;
             let q_y = z * (m[(1, 0)] * at + start.y) + offset.y;
             let q_z = z * (m[(2, 0)] * at + start.z) + offset.z;
@@ -410,7 +476,7 @@ impl QuadRow<'_> {
     /// The sixteen quads from `column` on, side by side: every candidate pixel of every quad's bounding box is tested
     /// against the triangle on its side of the diagonal.
     #[inline(always)]
-    fn draw_block(&self, column: usize, target: &mut Target) {
+    fn draw_block(&self, column: usize, target: &mut Target, block: &mut Block, batch: &mut Batch) {
         let mut triangles = [0u8; LANES];
         match self.cut[column..].first_chunk::<LANES>() {
             Some(quads) => triangles = *quads,
@@ -429,7 +495,6 @@ impl QuadRow<'_> {
             y: four_corners(&upper.y, &lower.y, column),
             inverse_depth: four_corners(&upper.inverse_depth, &lower.inverse_depth, column),
         };
-        let mut block = Block::NONE;
         block.bound(&corners, &triangles, target);
         let mut x_steps = 0;
         let mut y_steps = 0;
@@ -455,15 +520,17 @@ impl QuadRow<'_> {
         }
         block.prepare(&corners, &triangles, column, self.row);
         let steps = x_steps * y_steps;
+        let (mut x_step, mut y_step) = (0, 0);
         for first in (0..steps).step_by(BATCH) {
             // The hits of up to four candidates are written together: the end of the loop over them is hard to foresee.
-            let mut batch = Batch::NONE;
             let mut hits = 0u64;
-            for slot in 0..BATCH.min((steps - first) as usize) as i32 {
-                let step = first + slot;
-                let (x_step, y_step) = (step % x_steps, step / x_steps);
-                let found = block.sample(x_step, y_step, target, &mut batch, slot as usize);
-                hits |= u64::from(found) << (slot as usize * LANES);
+            for slot in 0..BATCH.min((steps - first) as usize) {
+                let found = block.sample(x_step, y_step, target, batch, slot);
+                hits |= u64::from(found) << (slot * LANES);
+                x_step += 1;
+                if x_step == x_steps {
+                    (x_step, y_step) = (0, y_step + 1);
+                }
             }
             while hits != 0 {
                 let hit = hits.trailing_zeros() as usize;
@@ -800,4 +867,4 @@ fn draw_triangle(triangle: [Vertex; 3], target: &mut Target) {
 
 /// Of a triangle's weights and, in pixels, of its bounds: rounding in single precision must not open a crack between
 /// neighbours. A view drawn from its own pose has every pixel exactly on a vertex, those of the border too.
-const EDGE_SLACK: f32 = 1e-3;
+pub const EDGE_SLACK: f32 = 1e-3;

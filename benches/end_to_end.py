@@ -1,0 +1,195 @@
+"""From published frame to received report, and how many robots a machine sustains.
+
+Needs: pip install -r tests/python/requirements.txt; and `cargo build --release`.
+Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10]`.
+
+Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second each: a JPEG, depth as 16-bit millimetres
+with noise, a pose. First one robot: time from putting a frame to its report, beside the same bytes sent there and back
+by a process that does nothing else. Then more and more robots, in as many places as there are cores, each time on a
+fresh service, until a frame has no report. Robots and service share the machine.
+"""
+
+import argparse
+import io
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import zenoh
+from PIL import Image as Picture
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "examples" / "python"), str(ROOT / "tests" / "python")]
+
+from daemon import Daemon, await_condition, free_port, open_session  # noqa: E402
+from surprised_proto import Frame, Image, SurpriseReport, encoding  # noqa: E402
+
+WIDTH, HEIGHT, FOCAL, DISTANCE_M = 320, 240, 300.0, 2.0
+FPS = 7.0
+# Pixels that the wall moves from one frame to the next, there and back.
+SHIFT, FRAMES = 3, 32
+WARM_UP_S = 3.0
+# Longer than this for a report is never.
+PATIENCE_S = 3.0
+
+
+def frames() -> list[bytes]:
+    """Frames without stamp and sequence: a camera that moves along a wall."""
+    rng = np.random.default_rng(1)
+    width = WIDTH + SHIFT * FRAMES
+    coarse = rng.integers(40, 215, (HEIGHT // 8, width // 8 + 1, 3), np.uint8)
+    wall = np.asarray(Picture.fromarray(coarse).resize((width, HEIGHT), Picture.Resampling.BICUBIC))
+    made = []
+    for index in range(FRAMES):
+        shift = SHIFT * index
+        file = io.BytesIO()
+        Picture.fromarray(wall[:, shift : shift + WIDTH]).save(file, "jpeg", quality=90)
+        depth = rng.normal(1000 * DISTANCE_M, 2.0, (HEIGHT, WIDTH)).round().astype("<u2")
+        message = Frame(
+            image=Image(encoding="jpeg", width=WIDTH, height=HEIGHT, data=file.getvalue()),
+            depth=Image(encoding="16UC1", width=WIDTH, height=HEIGHT, data=depth.tobytes()),
+        )
+        message.world_from_camera.position.x = shift * DISTANCE_M / FOCAL
+        message.world_from_camera.orientation.w = 1.0
+        lens = message.calibration.middle
+        lens.width, lens.height, lens.fx, lens.fy = WIDTH, HEIGHT, FOCAL, FOCAL
+        lens.cx, lens.cy = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+        made.append(message.SerializeToString())
+    return made + made[-2:0:-1]
+
+
+class Robots:
+    """Publish in turn, so that the load is even, and remember when each frame left and its report came."""
+
+    def __init__(self, session, count: int, places: int, bodies: list[bytes]):
+        self.bodies = bodies
+        self.left, self.took = {}, {}
+        self.keys = [f"surprised/place{i % places}/robot{i}/front" for i in range(count)]
+        self.subscriber = session.declare_subscriber("surprised/*/*/*/surprise/report", self._reported)
+        self.publishers = [
+            session.declare_publisher(
+                f"{key}/frame", encoding=encoding(Frame), congestion_control=zenoh.CongestionControl.BLOCK
+            )
+            for key in self.keys
+        ]
+        for publisher in self.publishers:
+            await_condition("the service listens for frames", lambda: publisher.matching_status.matching)
+
+    def _reported(self, sample):
+        now = time.perf_counter()
+        report = SurpriseReport.FromString(sample.payload.to_bytes())
+        key = (f"surprised/{report.place}/{report.robot}/{report.camera}", report.sequence)
+        if left := self.left.get(key):
+            self.took[key] = now - left
+
+    def run(self, seconds: float) -> tuple[int, list[float]]:
+        """Frames that were put after the warm-up, and the seconds until the report of those that had one."""
+        start = time.perf_counter()
+        counted = set()
+        turn = 0
+        while (due := start + turn / (FPS * len(self.keys))) < start + WARM_UP_S + seconds:
+            if (wait := due - time.perf_counter()) > 0:
+                time.sleep(wait)
+            robot, sequence = turn % len(self.keys), 1 + turn // len(self.keys)
+            head = Frame(sequence=sequence)
+            head.stamp.FromNanoseconds(time.time_ns())
+            # Messages that follow each other are one.
+            payload = head.SerializeToString() + self.bodies[(sequence + 5 * robot) % len(self.bodies)]
+            key = (self.keys[robot], sequence)
+            self.left[key] = time.perf_counter()
+            self.publishers[robot].put(payload)
+            if due >= start + WARM_UP_S:
+                counted.add(key)
+            turn += 1
+        end = time.perf_counter() + PATIENCE_S
+        while time.perf_counter() < end and not counted <= self.took.keys():
+            time.sleep(0.05)
+        return len(counted), [self.took[key] for key in counted if key in self.took]
+
+
+def echo(endpoint: str) -> None:
+    """Sends back what it gets, until its input ends."""
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        back = session.declare_publisher("back", congestion_control=zenoh.CongestionControl.BLOCK)
+        with session.declare_subscriber("there", lambda sample: back.put(sample.payload)):
+            print("ready", flush=True)
+            sys.stdin.read()
+
+
+def echo_times(bodies: list[bytes], seconds: float) -> list[float]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    child = subprocess.Popen(
+        [sys.executable, __file__, "--echo", endpoint], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    child.stdout.readline()
+    times, came = [], threading.Event()
+    with open_session(endpoint) as session:
+        subscriber = session.declare_subscriber("back", lambda _: came.set())
+        there = session.declare_publisher("there", congestion_control=zenoh.CongestionControl.BLOCK)
+        await_condition("the echo listens", lambda: there.matching_status.matching)
+        for turn in range(int(seconds * FPS)):
+            came.clear()
+            start = time.perf_counter()
+            there.put(bodies[turn % len(bodies)])
+            if came.wait(PATIENCE_S):
+                times.append(time.perf_counter() - start)
+            time.sleep(max(0.0, 1 / FPS - (time.perf_counter() - start)))
+        subscriber.undeclare()
+    child.stdin.close()
+    child.wait()
+    return times
+
+
+def describe(seconds: list[float]) -> str:
+    if not seconds:
+        return "none came"
+    median, late = np.percentile(seconds, [50, 99]) * 1e3
+    return f"median {median:.1f} ms, 99th percentile {late:.1f} ms"
+
+
+def serve(preset: str, robots: int, bodies: list[bytes], seconds: float) -> tuple[int, list[float]]:
+    daemon = Daemon("--preset", preset, "--engine", "cpu")
+    try:
+        with open_session(daemon.endpoint) as session:
+            return Robots(session, robots, min(robots, os.cpu_count() or 1), bodies).run(seconds)
+    finally:
+        daemon.end()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--preset", default="robust")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--first", type=int, default=10)
+    parser.add_argument("--step", type=int, default=10)
+    parser.add_argument("--echo", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.echo:
+        echo(options.echo)
+        return
+    bodies = frames()
+    size = np.mean([len(body) for body in bodies]) / 1024
+    print(f"frames of {size:.0f} KiB, {options.preset}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(f"echo: {describe(echo_times(bodies, options.seconds))}", flush=True)
+    put, took = serve(options.preset, 1, bodies, options.seconds)
+    print(f"1 robot: {describe(took)}; {put - len(took)} of {put} frames without a report", flush=True)
+    sustained, robots = 0, options.first
+    while True:
+        put, took = serve(options.preset, robots, bodies, options.seconds)
+        print(f"{robots} robots: {describe(took)}; {put - len(took)} of {put} frames without a report", flush=True)
+        if len(took) < put:
+            break
+        sustained, robots = robots, robots + options.step
+    print(f"sustained: {sustained} robots at {FPS:.0f} frames a second")
+
+
+if __name__ == "__main__":
+    main()
