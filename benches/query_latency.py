@@ -3,6 +3,10 @@
 Needs: pip install eclipse-zenoh==1.10.2 grpcio-tools numpy pillow; `cargo build --release`; the recording `revisit`. Run
 as `python benches/query_latency.py [BINARY [SECONDS]]`. One asker asks one kind of question after another, each as soon
 as the last was answered; then eight askers ask for priors at once. Everything goes over Zenoh on loopback.
+
+On two cores of a shared Xeon, 320x240, three seconds each, milliseconds (p50/p99): prior 10/27, with every plane 31/51,
+evaluate 16/37, views 0.3/2.1, status 0.2/2.8, next_view of 8 94/132, of 64 884/908 (four were asked), forget where nothing is
+6/28, eight askers for priors 86/120. Frames from sending to report: 18/29 while nobody asks, 15..31/30..73 meanwhile.
 """
 
 import json
@@ -170,6 +174,7 @@ def main(binary=ROOT / "target" / "release" / "surprised", seconds=8.0):
                 print(f"{label:<28}{len(answered):6}{len(refused):6}   {figures(answered):<24} | {figures(taken)}", flush=True)
             for robot in robots:
                 robot.stop.set()
+                robot.join()
     finally:
         service.terminate()
         service.wait()
