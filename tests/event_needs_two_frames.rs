@@ -40,6 +40,33 @@ fn a_flicker_of_one_frame_is_dropped_when_its_camera_sees_the_place_without_it()
 }
 
 #[test]
+fn what_is_learnt_at_once_is_new_as_long_as_it_is_still_there() {
+    let mut place = Place::default();
+    let view = View::calm("r1", at(0.0, 0.0, 0.0), WALL_M);
+    let region = view.region(1, CUP, 0.1, 40.0);
+    let first = view.clone().showing(&region, true);
+    assert!(place.see(&first, &mut [region.clone()]).is_empty());
+    // Seen from elsewhere, it is in another place of the image.
+    let moved = View::calm("r1", at(0.1, 0.05, 0.0), WALL_M);
+    let still_there = moved.region(1, CUP, 0.1, 40.0);
+    let changed = place.calm(&moved.showing(&still_there, false));
+    assert_eq!((changed.len(), changed[0].state), (1, State::New));
+    assert_eq!((changed[0].sightings, changed[0].peak_surprise), (1, 40.0));
+}
+
+#[test]
+fn what_is_gone_in_the_next_frame_was_a_flicker() {
+    let mut place = Place::default();
+    let view = View::calm("r1", at(0.0, 0.0, 0.0), WALL_M);
+    let region = view.region(1, CUP, 0.1, 40.0);
+    let flash = view.clone().showing(&region, true);
+    for _ in 0..10 {
+        assert!(place.see(&flash, &mut [region.clone()]).is_empty());
+        assert!(place.calm(&view).is_empty());
+    }
+}
+
+#[test]
 fn another_camera_that_sees_nothing_there_does_not_drop_it() {
     let mut place = Place::default();
     let one = View::calm("r1", at(0.0, 0.0, 0.0), WALL_M);

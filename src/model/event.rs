@@ -74,7 +74,7 @@ pub struct Event {
     pub peak_surprise: f32,
     /// Greatest share of a frame that was never seen, 0..1.
     pub unseen_share: f32,
-    /// Frames in which it was.
+    /// Frames in which it was surprising, or unseen.
     pub sightings: u32,
     /// Who saw it, in the order they did.
     pub robots: Vec<Arc<str>>,

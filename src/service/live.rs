@@ -550,3 +550,83 @@ fn box_of(region: &proto::Region) -> BoxState {
         touches_border: region.touches_border,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn live() -> Live {
+        Live {
+            boot: 7,
+            metrics: Arc::default(),
+            state: Mutex::new(State {
+                watchers: Some(broadcast::channel(MESSAGES_MAX).0),
+                places: BTreeMap::new(),
+                cameras: BTreeMap::new(),
+                events: VecDeque::new(),
+                last_number: 0,
+                news_dropped: 0,
+            }),
+        }
+    }
+
+    fn numbers(watching: &Watching) -> Vec<u64> {
+        let missed = watching.missed.iter();
+        missed
+            .map(|message| match **message {
+                Message::Event { number, .. } => number,
+                _ => panic!("only events are resumed"),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn who_was_away_gets_what_it_missed_or_is_told_that_it_is_too_much() {
+        let live = live();
+        let all = RESUMABLE_MAX as u64 + 10;
+        for _ in 0..all {
+            live.lock().hear(News::Event(Arc::default()));
+        }
+        let back = live.watch(Some((7, all - 3))).expect("it is open");
+        assert!(back.resumed);
+        assert_eq!(numbers(&back), [all - 2, all - 1, all]);
+        let up_to_date = live.watch(Some((7, all))).expect("it is open");
+        assert!(up_to_date.resumed && up_to_date.missed.is_empty());
+        assert!(live.watch(Some((7, 10))).expect("it is open").resumed);
+        for known in [Some((7, 9)), Some((7, all + 1)), Some((6, all)), None] {
+            let anew = live.watch(known).expect("it is open");
+            assert!(!anew.resumed, "{known:?}");
+        }
+        live.close();
+        assert!(live.watch(None).is_none());
+    }
+
+    #[test]
+    fn a_watcher_that_does_not_read_loses_messages_and_keeps_none() {
+        let live = live();
+        let mut watching = live.watch(None).expect("it is open");
+        for _ in 0..3 * MESSAGES_MAX {
+            live.lock().hear(News::Event(Arc::default()));
+        }
+        assert!(watching.messages.len() <= 3 * MESSAGES_MAX);
+        assert!(matches!(
+            watching.messages.try_recv(),
+            Err(broadcast::error::TryRecvError::Lagged(lost)) if lost == 2 * MESSAGES_MAX as u64
+        ));
+    }
+
+    #[test]
+    fn the_timeline_keeps_the_greatest_of_each_second_of_a_quarter_of_an_hour() {
+        let mut watched = Watched::default();
+        for frame in 0..10_000i64 {
+            watched.frame(frame * 100_000_000, (frame % 10) as f32, 0.9);
+        }
+        assert_eq!(watched.timeline.len(), POINTS_MAX);
+        let last = watched.timeline.back().expect("there are some");
+        assert_eq!((last.t, last.max_surprise, last.frames), (999, 9.0, 10));
+        assert_eq!(
+            watched.state(&CameraStatus::default()).max_surprise_since,
+            Some(9.0)
+        );
+    }
+}

@@ -400,8 +400,7 @@ impl Out<'_, '_> {
         kind: MetricType,
         write: impl FnOnce(&mut MetricEncoder, &[Seen]) -> fmt::Result,
     ) -> fmt::Result {
-        let name = format!("surprised_{name}");
-        let mut encoder = self.encoder.encode_descriptor(&name, help, None, kind)?;
+        let mut encoder = self.encoder.encode_descriptor(name, help, None, kind)?;
         write(&mut encoder, self.seen)
     }
 

@@ -149,7 +149,7 @@ def test_errors_of_every_layer_are_problem_documents(daemon):
         ("POST", "/api/v1/session", json_kind, b"{", 400),
         ("POST", "/api/v1/session", json_kind, b"{}", 400),
         ("POST", "/api/v1/session", {}, b"{}", 415),
-        ("POST", "/api/v1/session", json_kind, b"x" * (2 << 20), 413),
+        ("POST", "/api/v1/session", json_kind, b"x" * ((1 << 20) + 9), 413),
         ("GET", "/api/v1/places/%FF", {}, None, 400),
         ("GET", "/api/v1/places/x/events?limit=none", {}, None, 400),
     ]:

@@ -35,6 +35,13 @@ def told(session, place):
     subscriber.undeclare()
 
 
+@pytest.fixture
+def observing(session, place, settled):
+    """A robot that reports and does not learn."""
+    ask(session, f"surprised/{place}/@memory/mode?set=observe")
+    return settled
+
+
 def listed(daemon, place, query="") -> dict:
     return daemon.fetch_json(f"/api/v1/places/{place}/events{query}")
 
@@ -51,11 +58,11 @@ def test_a_box_becomes_an_event_in_its_second_frame(daemon, place, settled, told
         stream.next("hello")
         first = settled.show(scene.BOX)
         assert first.regions and first.regions[0].event_id == 0
-        second = settled.show(scene.BOX)
+        # A camera that stands still learns it at once: it is there, and not surprising any more.
+        assert not settled.show(scene.BOX).regions
         event = told("change", "new")
-        assert second.regions[0].event_id == event.id
-        assert event.first_seen == first.stamp and event.last_seen == second.stamp
-        assert list(event.robots) == [settled.robot] and event.sightings == 2
+        assert event.first_seen == event.last_seen == first.stamp
+        assert list(event.robots) == [settled.robot] and event.sightings == 1 and event.peak_surprise > 6
         assert scene.overlap(scene.corners(event.peak.box), scene.BOX) >= 0.6
         assert 2.85 < event.center_in_world.z < 3.05
         assert 0.15 < event.extent_in_world.x < 0.4
@@ -63,6 +70,20 @@ def test_a_box_becomes_an_event_in_its_second_frame(daemon, place, settled, told
         assert message.id and message.data["id"] == str(event.id)
         assert message.data == change(daemon, place)
         assert message.data == daemon.fetch_json(f"/api/v1/places/{place}/events/{event.id}")
+
+
+def test_it_lasts_while_it_is_surprising_and_ends_when_it_is_gone(daemon, place, observing, told):
+    for _ in range(30):
+        report = observing.show(scene.BOX)
+    event = told("change", "new")
+    assert report.regions[0].event_id == event.id
+    assert change(daemon, place)["sightings"] >= 20, "told of once a second"
+    for _ in range(7):
+        observing.show()
+    assert change(daemon, place)["id"] == str(event.id)
+    observing.show()
+    ended = told("change", "end")
+    assert ended.id == event.id and ended.sightings == 30 and ended.last_seen == report.stamp
 
 
 def test_it_ends_when_its_place_is_as_expected(daemon, place, settled, told):
@@ -80,11 +101,11 @@ def test_it_ends_when_its_place_is_as_expected(daemon, place, settled, told):
     assert not [event for event in listed(daemon, place, "?state=open")["events"] if event["kind"] == "change"]
 
 
-def test_a_flicker_of_one_frame_is_no_event(daemon, place, settled):
+def test_a_flicker_of_one_frame_is_no_event(daemon, place, observing):
     for _ in range(3):
-        assert settled.show(scene.BOX).regions
+        assert observing.show(scene.BOX).regions
         for _ in range(3):
-            settled.show()
+            assert not observing.show().regions
     assert not [event for event in listed(daemon, place)["events"] if event["kind"] == "change"]
 
 
@@ -100,14 +121,14 @@ def test_who_comes_late_gets_the_latest_state(daemon, session, place, settled, t
     assert ids == {event["id"] for event in listed(daemon, place)["events"]} and str(event.id) in ids
 
 
-def test_another_robot_sees_the_same_event(daemon, session, place, settled, told):
+def test_another_robot_sees_the_same_event(session, place, observing, told):
     for _ in range(2):
-        settled.show(scene.BOX)
+        observing.show(scene.BOX)
     event = told("change", "new")
     other = Robot(session, place, "robot2", "rear")
-    other.show(scene.BOX)
+    assert other.show(scene.BOX).regions[0].event_id == event.id
     joined = told("change", "update")
-    assert joined.id == event.id and list(joined.robots) == [settled.robot, "robot2"]
+    assert joined.id == event.id and list(joined.robots) == [observing.robot, "robot2"]
 
 
 def test_its_pictures_show_what_is_and_what_was(daemon, place, settled, told):

@@ -5,7 +5,9 @@ import re
 import subprocess
 import sys
 
-from daemon import BINARY, DEADLINE_S, ROOT
+import pytest
+import scene
+from daemon import BINARY, DEADLINE_S, ROOT, Daemon, Robot, open_session
 
 EXAMPLES = ROOT / "examples" / "python"
 
@@ -44,6 +46,34 @@ def test_publish_frames_prints_the_box_that_appears_and_ask_prior_knows_the_wall
     assert len(lines) == 8 and sorted(int(line.split()[0]) for line in lines) == list(range(0, 360, 45))
     # The camera never turned: what lies ahead of it is known best, so it teaches least.
     assert lines[-1].startswith("0 degrees"), planned.stdout
+
+
+@pytest.fixture
+def own_daemon(binary):
+    daemon = Daemon()
+    yield daemon
+    daemon.end()
+
+
+def test_watch_events_tells_what_lasts_and_what_comes(own_daemon):
+    with open_session(own_daemon.endpoint) as session:
+        robot = Robot(session, "lab", "watched")
+        for _ in range(8):
+            robot.show()
+        for _ in range(2):
+            robot.show(scene.BOX)
+        watching = subprocess.Popen(
+            [sys.executable, EXAMPLES / "watch_events.py", own_daemon.endpoint], stdout=subprocess.PIPE, text=True
+        )
+        try:
+            lines = iter(watching.stdout.readline, "")
+            assert any(re.search(r"\d+ change new: [\d.]+ nats at \(.*\) m, seen by watched", line) for line in lines)
+            for _ in range(30):
+                robot.show(scene.BOX)
+            assert any("change end" in line for line in lines)
+        finally:
+            watching.kill()
+            watching.communicate()
 
 
 def test_ask_prior_says_so_when_nobody_answers(daemon, tmp_path):

@@ -67,11 +67,11 @@ async fn regions_spans_and_places_are_forgotten() {
     let path = "POST /api/v1/places/lab/forget";
     let reply = send_json(&rig, path, encode::json(&request)).await;
     assert_eq!(
-        (reply.status, &reply.json()["viewpointsRemoved"]),
+        (reply.status, &reply.json()["viewpoints_removed"]),
         (200, &json!("2"))
     );
     let reply = send_json(&rig, path, json!({"everything": true})).await;
-    assert_eq!(reply.json()["viewpointsRemoved"], (views - 2).to_string());
+    assert_eq!(reply.json()["viewpoints_removed"], (views - 2).to_string());
     assert_eq!(covered(&rig).await, 0.0);
     let status = rig.status("lab").await;
     assert_eq!(

@@ -22,7 +22,7 @@ impl Page {
 
 async fn get(rig: &Rig, path: &str) -> Page {
     let mut stream = TcpStream::connect(rig.http).await.expect("connects");
-    let request = format!("GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n\r\n");
+    let request = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
     stream.write_all(request.as_bytes()).await.expect("written");
     let mut bytes = Vec::new();
     patient(stream.read_to_end(&mut bytes)).await.expect("read");

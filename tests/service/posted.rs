@@ -98,7 +98,7 @@ async fn a_posted_frame_is_evaluated_and_not_learnt() {
     assert_eq!(page.status, 200, "{}", String::from_utf8_lossy(&page.body));
     let report = &page.json()["report"];
     assert!(
-        report["regions"][0]["peakSurprise"].as_f64() > Some(6.0),
+        report["regions"][0]["peak_surprise"].as_f64() > Some(6.0),
         "{report}"
     );
     assert_eq!(report["place"], "lab");

@@ -22,7 +22,7 @@ impl Page {
 /// `method` with its path; `head` are whole lines.
 pub async fn send(rig: &Rig, method: &str, head: &[&str], body: &[u8]) -> Page {
     let mut stream = TcpStream::connect(rig.http).await.expect("connects");
-    let mut request = format!("{method} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n");
+    let mut request = format!("{method} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n");
     for line in head {
         request += &format!("{line}\r\n");
     }

@@ -17,7 +17,7 @@ use surprised::{
     stages::{
         attend::{BLOCK, BlockMap, Scene},
         events::{Events, Look},
-        interpolate::prior::{COVERAGE, Prior},
+        interpolate::prior::{COVERAGE, Prior, TAU},
     },
 };
 
@@ -53,6 +53,9 @@ pub fn turned(position: [f64; 3], angle_rad: f64) -> Pose {
     )
 }
 
+/// Of everything that is expected.
+const GREY: u8 = 90;
+
 /// What a camera sees in one frame.
 #[derive(Clone)]
 pub struct View {
@@ -61,6 +64,7 @@ pub struct View {
     pub depth_m: Vec<f32>,
     pub evidence: BlockMap,
     pub prior: Prior,
+    pub image: RgbImage,
 }
 
 impl View {
@@ -68,8 +72,17 @@ impl View {
     pub fn calm(robot: &str, world_from_camera: Pose, z_m: f64) -> Self {
         let mut prior = Prior::default();
         prior.resize(WIDTH, HEIGHT);
-        prior.data.fill(1.0);
+        prior.data.fill(0.0);
+        for row in prior.data.chunks_exact_mut(16 * WIDTH) {
+            row[TAU * WIDTH..][..WIDTH].fill(f32::from(GREY));
+            row[COVERAGE * WIDTH..][..WIDTH].fill(7.0);
+        }
         Self {
+            image: RgbImage {
+                width: WIDTH,
+                height: HEIGHT,
+                data: vec![GREY; WIDTH * HEIGHT * 3],
+            },
             source: source(robot),
             world_from_camera,
             depth_m: vec![z_m as f32; WIDTH * HEIGHT],
@@ -93,6 +106,26 @@ impl View {
         for y in pixel_box.y_min as usize..pixel_box.y_max as usize {
             for x in pixel_box.x_min as usize..pixel_box.x_max as usize {
                 self.prior.data[(y * 16 + COVERAGE) * WIDTH + x] = 0.0;
+            }
+        }
+        self
+    }
+
+    /// Something bright is where the region is; with evidence for it if it is not yet expected.
+    pub fn showing(mut self, region: &Region, surprising: bool) -> Self {
+        let PixelBox {
+            x_min,
+            y_min,
+            x_max,
+            y_max,
+        } = region.pixel_box;
+        for y in y_min as usize..y_max as usize {
+            for x in x_min as usize..x_max as usize {
+                self.image.data[3 * (y * WIDTH + x)..][..3].fill(200);
+                if surprising {
+                    let block = y / BLOCK * self.evidence.width + x / BLOCK;
+                    self.evidence.data[block] = region.peak_surprise;
+                }
             }
         }
         self
@@ -139,16 +172,11 @@ impl Place {
     pub fn see(&mut self, view: &View, regions: &mut [Region]) -> Vec<Event> {
         self.frames += 1;
         let unseen = view.prior.plane(COVERAGE).filter(|&views| views == 0.0);
-        let image = RgbImage {
-            width: WIDTH,
-            height: HEIGHT,
-            data: vec![90; WIDTH * HEIGHT * 3],
-        };
         let look = Look {
             source: &view.source,
             stamp_ns: self.stamp_ns(),
             sequence: self.frames,
-            image: &image,
+            image: &view.image,
             scene: Scene {
                 depth_m: &view.depth_m,
                 intrinsics: &INTRINSICS,

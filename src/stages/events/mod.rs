@@ -6,7 +6,9 @@
 //! - *Which is which*: a region belongs to the event that it was in before (its id says so), else to the nearest one whose
 //!   place is within [`SAME_WITHIN_M`], the size of a tabletop object, or within the larger one's half size, because
 //!   cameras on two sides of a thing see centres that far apart; never beyond [`SAME_WITHIN_MAX_M`].
-//! - *New*: in two frames. A flicker of one frame is dropped when its camera sees the place without it.
+//! - *New*: in two frames. In the second it need not surprise any more, because a camera that stands still learns a thing
+//!   at once: it is enough that its place still looks as it did when it surprised, rather than as it was expected. A
+//!   flicker of one frame does not; it is dropped when its camera sees the place without it.
 //! - *End*: [`CLEAR_LOOKS`] frames in a row, of any cameras, saw its place and nothing surprising there. A look counts if
 //!   the place lies inside the image, nothing stands before it, and it appears at least half as large as when it was
 //!   last seen. What nobody looks at does not end.
@@ -17,6 +19,8 @@
 //!
 //! No clock: ages are counted in frames of the place, and stamps of different robots are never compared.
 
+mod appearance;
+
 mod picture;
 
 mod unseen;
@@ -25,7 +29,10 @@ use std::sync::Arc;
 
 use nalgebra::{Point3, Vector3};
 
-use self::unseen::{UNSEEN_KEPT, UNSEEN_SHARE, UnseenArea};
+use self::{
+    appearance::Patch,
+    unseen::{UNSEEN_KEPT, UNSEEN_SHARE, UnseenArea},
+};
 use crate::{
     config::Settings,
     model::{
@@ -90,6 +97,15 @@ impl<'a> Look<'a> {
         ((prior.width, prior.height) == size).then_some(prior)
     }
 
+    fn rgb(&self, x: usize, y: usize) -> [u8; 3] {
+        let at = 3 * (y * self.image.width + x);
+        [
+            self.image.data[at],
+            self.image.data[at + 1],
+            self.image.data[at + 2],
+        ]
+    }
+
     fn sighting(&self, pixel_box: PixelBox, surprise: f32) -> Sighting {
         Sighting {
             source: self.source.clone(),
@@ -126,6 +142,8 @@ struct Followed {
     best: Option<(bool, f32)>,
     /// By which ids which cameras report it.
     known_by: Vec<(Source, u64)>,
+    /// Of a candidate: how it looked when it surprised.
+    patches: Vec<Patch>,
     /// Of an unseen area: points of it in the world, and whether they are known by now.
     points: Vec<(Point3<f64>, bool)>,
 }
@@ -163,7 +181,7 @@ impl Events {
         // Of each region, the id of what it belongs to.
         let mut ids = Vec::new();
         for region in regions.iter() {
-            ids.push(self.sight_region(look, region));
+            ids.push(self.sight_region(look, region, settings));
         }
         let follows_unseen = self
             .followed
@@ -211,7 +229,7 @@ impl Events {
     }
 
     /// The id of the event or candidate that the region belongs to.
-    fn sight_region(&mut self, look: &Look, region: &Region) -> u64 {
+    fn sight_region(&mut self, look: &Look, region: &Region, settings: &Settings) -> u64 {
         let placed = region
             .center_in_world
             .map(|center| (center, extent(region.pixel_box, &center, &look.scene)));
@@ -246,6 +264,9 @@ impl Events {
                 followed.event.extent_in_world = extent;
             }
             followed.event.picture = Some(pictured(look, region.pixel_box));
+            if let (None, Some(prior)) = (&followed.told, look.prior()) {
+                followed.patches = appearance::patches(look, prior, region, settings);
+            }
         }
         followed.sighted(sighting, self.frames);
         followed.event.id
@@ -381,6 +402,7 @@ impl Events {
             half_size_px: 0.0,
             best: None,
             known_by: Vec::new(),
+            patches: Vec::new(),
             points: Vec::new(),
         });
         Some(self.followed.len() - 1)
@@ -439,6 +461,9 @@ impl Followed {
 
     /// Hears what a frame in which it was not says about it; whether that makes an event of a candidate.
     fn settle(&mut self, look: &Look, prior: Option<&Prior>, settings: &Settings) -> bool {
+        if self.told.is_none() && appearance::is_still_there(&self.patches, look) == Some(true) {
+            return true;
+        }
         let verdict = match (self.event.kind, self.event.center_in_world) {
             (Kind::Change, Some(center)) => self.look_at(&center, look, settings),
             // Without a place it is where its camera looks.
@@ -475,6 +500,7 @@ impl Followed {
     }
 
     fn tell(&mut self, stamp_ns: i64, state: State, changed: &mut Vec<Event>) {
+        self.patches = Vec::new();
         self.event.state = state;
         self.told = Some(Told {
             stamp_ns,
