@@ -41,14 +41,14 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def await_condition(what: str, condition):
+def await_condition(what: str, condition, within_s: float = DEADLINE_S):
     """The first true value of `condition()`."""
-    end = time.monotonic() + DEADLINE_S
+    end = time.monotonic() + within_s
     while time.monotonic() < end:
         if value := condition():
             return value
         time.sleep(0.02)
-    raise AssertionError(f"not within {DEADLINE_S} s: {what}")
+    raise AssertionError(f"not within {within_s} s: {what}")
 
 
 class Daemon:

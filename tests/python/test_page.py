@@ -1,12 +1,14 @@
 """The page in a real browser against a running demo: what an operator does with it, in the order they would."""
 
+import math
 import re
 import subprocess
-import time
+import tempfile
+from pathlib import Path
 
 import pytest
 from browser import DESKTOP, PHONE, browser, visit
-from daemon import BINARY, DEADLINE_S, await_condition, free_port
+from daemon import BINARY, await_condition, free_port
 
 # The robots get to know the table for 350 frames; the first thing comes within 84 more. Each takes up to half a second
 # on a busy machine.
@@ -17,23 +19,37 @@ ACCESSIBILITY = pytest.importorskip(
 )
 
 
+# A surprise whose cause is a thing: neither nothing nor the person who brings it.
+THING = re.compile(r" at \((\S+), (\S+), (\S+)\) m, .* - (?!nothing|person|where)(.+)$")
+# From a region's middle to an event's, which is that of all who saw it.
+NEAR_M = 0.15
+
+
 class Demo:
     def __init__(self, port: int):
         self.http = f"http://127.0.0.1:{port}"
+        self._printed = tempfile.NamedTemporaryFile("w")
         self.process = subprocess.Popen(
             [BINARY, "demo", "--http", f"127.0.0.1:{port}"],
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=self._printed,
             stderr=subprocess.DEVNULL,
-            text=True,
         )
-        # Printed once HTTP is served.
-        self.first_line = self.process.stdout.readline()
+        await_condition("the demo has begun", self.lines)
+
+    def lines(self) -> list[str]:
+        """What it has printed so far."""
+        return Path(self._printed.name).read_text().splitlines()
+
+    def things(self) -> list[tuple[float, ...]]:
+        """Where it has said that the script put something."""
+        found = (THING.search(line) for line in self.lines())
+        return [tuple(float(x) for x in at.groups()[:3]) for at in found if at]
 
     def end(self):
         self.process.kill()
         self.process.wait()
-        self.process.stdout.close()
+        self._printed.close()
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +86,7 @@ def violations(page) -> list[str]:
 
 
 def test_the_demo_prints_the_address_of_the_page(demo):
-    assert demo["demo"].http in demo["demo"].first_line
+    assert demo["demo"].http in demo["demo"].lines()[0]
 
 
 def test_both_robots_appear_live_with_what_they_see_and_expect(opened):
@@ -93,23 +109,31 @@ def test_the_place_is_drawn_from_above_with_robots_and_viewpoints(opened):
     assert 0.5 < (x * x + y * y) ** 0.5 < 3.0, "a robot drives around the table"
 
 
-def test_an_object_that_is_put_down_is_boxed_and_listed_as_an_event(opened):
+def test_an_object_that_is_put_down_is_boxed_and_listed_as_an_event(opened, demo):
     page = opened.page
-    page.locator("#events .event").first.wait_for(timeout=1000 * EVENT_WITHIN_S)
-    end = time.monotonic() + EVENT_WITHIN_S
-    while True:
-        boxed = set(page.evaluate("() => [...window.boxed]"))
-        listed = {event.get_attribute("data-key") for event in page.locator("#events .event").all()}
-        if boxed & listed:
-            break
-        assert time.monotonic() < end, (boxed, listed)
-        page.wait_for_timeout(200)
-    event = page.locator(f'#events .event[data-key="{(boxed & listed).pop()}"]')
+
+    def listed() -> str | None:
+        """The key of an event that was boxed, and stands where the script put something."""
+        things = demo["demo"].things()
+        for key, where in page.evaluate(
+            """() => [...document.querySelectorAll('.event[data-kind="change"]')]
+                .filter((event) => window.boxed.has(event.dataset.key))
+                .map((event) => [event.dataset.key, event.innerText.match(/Where\\s+(.+) m/)?.[1]])"""
+        ):
+            at = [float(x.replace("\u2212", "-")) for x in where.split(", ")] if where else None
+            if at and any(math.dist(at, thing) < NEAR_M for thing in things):
+                return key
+        return None
+
+    key = await_condition("an object is boxed and listed", listed, EVENT_WITHIN_S)
+    opened.shot("desktop-light")
+    event = page.locator(f'#events .event[data-key="{key}"]')
     words = event.inner_text()
     assert re.search(r"robot[01]", words) and "nats" in words, words
+    assert re.search(r"\d\d:\d\d:\d\d", words), words
+    event.scroll_into_view_if_needed()
     for picture in event.locator("img").all():
         await_condition("its thumbnail is there", lambda p=picture: p.evaluate("image => image.naturalWidth") > 8)
-    opened.shot("desktop-light")
 
 
 def test_pointing_at_the_map_asks_what_the_memory_expects_there(opened):
