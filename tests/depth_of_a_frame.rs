@@ -5,7 +5,6 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 use surprised::{
     config::Settings,
-    evaluation::simulated_depth,
     model::{
         camera::Intrinsics,
         frame::{DepthSource, Frame, GreyImage, RgbImage, SideView, Sides, Source},
@@ -51,7 +50,9 @@ fn computed_depth_agrees_with_given_depth() {
     let script = Script::tabletop(1);
     let capture = script.capture(0, 40, Views::Triple);
     let intrinsics = script.stations[0].rig.intrinsics;
-    let sides = simulated_depth::sides(&script, 0, &capture).expect("all cameras were rendered");
+    let sides = script
+        .sides(0, &capture)
+        .expect("all cameras were rendered");
     let settings = Settings::robust();
     let given = DepthSource::Given(capture.middle.depth_m.clone());
     let computed = DepthSource::Sides(Box::new(sides));

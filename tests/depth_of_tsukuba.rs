@@ -2,8 +2,9 @@
 
 use std::path::PathBuf;
 use surprised::{
+    config::Settings,
     evaluation::stereo::{BadPixels, Cameras, StereoScene, evaluate},
-    stages::depth::{DepthSettings, InverseDepthRange},
+    stages::depth::DepthSettings,
 };
 
 #[test]
@@ -16,7 +17,7 @@ fn at_most_two_percent_of_tsukuba_is_wrong_and_more_with_two_cameras() {
         return;
     }
     let scene = StereoScene::open(&folder).unwrap();
-    let range = InverseDepthRange::new(0.0, 16.0, 33).unwrap();
+    let range = scene.disparities(Settings::robust().depth_labels);
     let bad =
         |cameras| -> BadPixels { evaluate(&scene, DepthSettings::default(), cameras, &range) };
     let (three, two) = (bad(Cameras::Three), bad(Cameras::Two));

@@ -2,9 +2,12 @@
 
 use std::{fs, path::Path};
 
-use surprised::simulation::{
-    script::{Script, Views},
-    write::{Options, Truth, WriteError, recording},
+use surprised::{
+    simulation::{
+        script::{Script, Views},
+        write::{Options, Truth, WriteError, recording},
+    },
+    stages::depth::InverseDepthRange,
 };
 
 fn lines(dir: &Path, name: &str) -> Vec<String> {
@@ -112,6 +115,31 @@ fn the_shade_of_the_cup_is_ignored_and_the_cup_is_not() {
     assert!(shaded, "below the cup's foot lies its shade");
     let share = ignored.iter().filter(|&&value| value == 255).count() as f64 / ignored.len() as f64;
     assert!((0.002..0.2).contains(&share), "{share} of the image");
+}
+
+#[test]
+fn a_robot_without_a_depth_camera_writes_what_its_three_cameras_tell() {
+    let dir = tempfile::tempdir().unwrap();
+    let dir = dir.path();
+    let script = Script::tabletop(1);
+    let range = InverseDepthRange::new(0.05, 2.5, 64).unwrap();
+    recording(dir, &script, &some(Truth::Computed(range))).unwrap();
+    let stamp = &lines(dir, "depth.txt")[1];
+    let written = image::open(dir.join(stamp.split(' ').nth(1).unwrap())).unwrap();
+    let frame = (stamp.split(' ').next().unwrap().parse::<f64>().unwrap() - 1000.0) * 7.0;
+    let capture = script.capture(0, frame.round() as u64, Views::Middle);
+    let mut errors: Vec<f32> = written
+        .as_luma16()
+        .expect("16 bit")
+        .pixels()
+        .zip(&capture.middle.depth_m)
+        .filter(|(written, _)| written.0[0] > 0)
+        .map(|(written, truth_m)| (f32::from(written.0[0]) / 5000.0 - truth_m).abs() / truth_m)
+        .collect();
+    errors.sort_by(f32::total_cmp);
+    let median = errors[errors.len() / 2];
+    // Far above what 16 bits lose, far below a wrong unit or another frame.
+    assert!(median > 1e-3 && median < 2e-2, "{median}");
 }
 
 #[test]

@@ -32,7 +32,11 @@ use crate::{
         table::{Table, number},
     },
     isa::Isa,
-    simulation::{script::Script, write},
+    pipeline::depth_range,
+    simulation::{
+        script::Script,
+        write::{self, Truth},
+    },
 };
 
 /// Judge settings on a recording with truth, beside image differencing.
@@ -42,6 +46,9 @@ pub struct EvaluateArgs {
     /// `simulated`: the paper's experiment in the simulated world.
     #[arg(required_unless_present = "depth", value_name = "DIR|simulated")]
     dir: Option<PathBuf>,
+    /// With `simulated`: the robot has no depth camera, depth is computed from its three cameras.
+    #[arg(long, conflicts_with = "depth")]
+    rig: bool,
     /// Judge computed depth instead, on a folder with left.png, middle.png, right.png and disparity.png (value / 16 =
     /// pixels), or `simulated`: frames of the tabletop script.
     #[arg(long, value_name = "DIR|simulated", conflicts_with_all = ["dir", "csv", "figures", "leave_one_out"])]
@@ -113,10 +120,13 @@ impl FromStr for Ball {
 const SIMULATED: &str = "simulated";
 
 /// The paper's sequence I1 as its robot records it, in a folder that goes when it is dropped.
-fn simulate(seed: u64) -> anyhow::Result<TempDir> {
+fn simulate(seed: u64, truth: Truth) -> anyhow::Result<TempDir> {
     let folder = tempfile::tempdir().context("no temporary folder can be made")?;
     let script = Script::tabletop(seed);
-    let options = write::Options::whole(&script, u64::MAX);
+    let options = write::Options {
+        truth,
+        ..write::Options::whole(&script, u64::MAX)
+    };
     write::recording(&folder.path().join(SIMULATED), &script, &options)?;
     Ok(folder)
 }
@@ -161,8 +171,18 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         .as_deref()
         .context("name a recording to evaluate, or --depth")?;
     // Dropped, and so removed, at the end.
-    let simulated = (dir == Path::new(SIMULATED))
-        .then(|| simulate(arguments.seed))
+    let is_simulated = dir == Path::new(SIMULATED);
+    anyhow::ensure!(
+        is_simulated || !arguments.rig,
+        "--rig is for `simulated`: a recording has the depth that it has"
+    );
+    let truth = if arguments.rig {
+        Truth::Computed(depth_range(&settings))
+    } else {
+        Truth::Measured
+    };
+    let simulated = is_simulated
+        .then(|| simulate(arguments.seed, truth))
         .transpose()?;
     let recordings = match &simulated {
         Some(folder) => dataset::open(&folder.path().join(SIMULATED))?,

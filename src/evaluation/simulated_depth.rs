@@ -1,14 +1,17 @@
 //! How good computed depth is in the simulated room, against exact truth: the share of pixels within one label of it.
+//!
+//! A pixel at a silhouette is a mixture of two surfaces, and no camera tells which of them its centre hits. Where the
+//! truth in its four quarters differs by more than a label, depth of any of them is right.
 
 use serde::Serialize;
 
 use crate::{
     isa::Isa,
-    model::frame::{SideView, Sides},
+    model::camera::Intrinsics,
     simulation::{
         room::is_on_cloth,
         scene::ObjectId,
-        script::{Capture, Script, Shot, Views},
+        script::{Script, Views},
     },
     stages::depth::{InverseDepthRange, SidesDepth},
 };
@@ -21,10 +24,16 @@ pub struct WithinLabel {
     pub labels: usize,
     /// Of inverse depth, 1/m.
     pub label_step: f64,
-    /// Everything nearer than the farthest label but glass and cloth.
+    /// Everything nearer than the farthest label but glass.
     pub within_one_label: Option<f64>,
+    /// Of these, against the truth at the pixel's centre alone.
+    pub within_one_label_at_centre: Option<f64>,
+    /// Of these, mixtures.
+    pub mixed: Option<f64>,
     /// Of the tablecloth, whose pattern repeats.
     pub cloth: Option<f64>,
+    /// Of what is neither glass nor cloth.
+    pub besides_cloth: Option<f64>,
     /// Of the glass's own front.
     pub glass: Option<f64>,
     /// Of what is behind the glass, where it is seen through it.
@@ -52,19 +61,18 @@ impl Share {
     }
 }
 
-/// The rig's side images of a capture with [`Views::Triple`], as the service gets them; `None` with another.
-pub fn sides(script: &Script, station: usize, capture: &Capture) -> Option<Sides> {
-    let rig = &script.stations[station].rig;
-    let (left, right) = capture.sides.as_ref()?;
-    let view = |shot: &Shot, middle_from_side| SideView {
-        image: shot.image.grey(),
-        intrinsics: rig.intrinsics,
-        middle_from_side,
+/// The same script with twice the pixels along each side: four to one of `camera`'s.
+fn quartered(script: &Script, camera: &Intrinsics) -> Script {
+    let mut script = script.clone();
+    script.stations[0].rig.intrinsics = Intrinsics {
+        width: 2 * camera.width,
+        height: 2 * camera.height,
+        fx: 2.0 * camera.fx,
+        fy: 2.0 * camera.fy,
+        cx: 2.0 * camera.cx + 0.5,
+        cy: 2.0 * camera.cy + 0.5,
     };
-    Some(Sides {
-        left: view(left, rig.middle_from_left),
-        right: view(right, rig.middle_from_right),
-    })
+    script
 }
 
 /// Computes the depth of these frames of the script's first station, without a memory's expectation.
@@ -74,14 +82,19 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
         .find(|(name, _)| *name == "glass")
         .map(|(_, id)| id);
     let mut depth = SidesDepth::new(range, Isa::detect());
-    let [mut others, mut cloth, mut glass, mut behind, mut invalid]: [Share; 5] =
-        std::array::from_fn(|_| Share::default());
+    let intrinsics = script.stations[0].rig.intrinsics;
+    let quartered = quartered(script, &intrinsics);
+    let mut all = Share::default();
+    let [mut at_centre, mut mixed, mut invalid] = [(); 3].map(|()| Share::default());
+    let [mut cloth, mut others, mut glass, mut behind] = [(); 4].map(|()| Share::default());
     let mut errors: Vec<f32> = Vec::new();
     for &frame in frames {
         let capture = script.capture(0, frame, Views::Triple);
-        let sides = sides(script, 0, &capture).expect("all cameras were rendered");
+        let sides = script
+            .sides(0, &capture)
+            .expect("all cameras were rendered");
         let middle = &capture.middle;
-        let intrinsics = script.stations[0].rig.intrinsics;
+        let quarters_m = quartered.capture(0, frame, Views::Middle).middle.depth_m;
         let computed = depth.compute(&intrinsics, &middle.image.grey(), &sides, None);
         for (pixel, &computed_m) in computed.depth_m.iter().enumerate() {
             let near = |true_m: f32| {
@@ -104,8 +117,19 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
             let point = intrinsics.unproject(u as f64, v as f64, f64::from(true_m));
             let on_cloth =
                 seen == ObjectId::ROOM && is_on_cloth(&(capture.world_from_camera * point));
+            let corner = 2 * (v * 2 * intrinsics.width + u);
+            let below = corner + 2 * intrinsics.width;
+            let quarters =
+                [corner, corner + 1, below, below + 1].map(|quarter| quarters_m[quarter]);
+            let farthest = quarters.into_iter().fold(0.0, f32::max);
+            let nearest = quarters.into_iter().fold(f32::INFINITY, f32::min);
+            let is_mixed = 1.0 / nearest - 1.0 / farthest > computed.label_step;
+            let good = near(true_m) || is_mixed && quarters.into_iter().any(near);
+            all.add(good);
+            at_centre.add(near(true_m));
+            mixed.add(is_mixed);
             let share = if on_cloth { &mut cloth } else { &mut others };
-            share.add(near(true_m));
+            share.add(good);
         }
     }
     let median = errors.len() / 2;
@@ -117,8 +141,11 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
         frames: frames.len(),
         labels: range.labels,
         label_step: range.step(),
-        within_one_label: others.percent(),
+        within_one_label: all.percent(),
+        within_one_label_at_centre: at_centre.percent(),
+        mixed: mixed.percent(),
         cloth: cloth.percent(),
+        besides_cloth: others.percent(),
         glass: glass.percent(),
         behind_glass: behind.percent(),
         invalid: invalid.percent(),

@@ -91,6 +91,14 @@ impl StereoScene {
         })
     }
 
+    /// From infinitely far, half a pixel a label: so many labels, or as many more as the nearest point takes.
+    pub fn disparities(&self, labels: usize) -> InverseDepthRange {
+        let most = self.disparity.iter().copied().fold(0.0, f32::max).ceil() as usize;
+        let labels = labels.max(2 * most + 1).clamp(2, 255);
+        InverseDepthRange::new(0.0, (labels - 1) as f64 / 2.0, labels)
+            .expect("two labels or more, half a pixel apart")
+    }
+
     /// A rig whose inverse depth in 1/m *is* the disparity in pixels: baseline 1 m, focal length 1 pixel.
     pub fn rig(&self, cameras: Cameras) -> DepthRig {
         let intrinsics = Intrinsics {

@@ -18,7 +18,7 @@ use super::{
 use crate::{
     model::{
         camera::Intrinsics,
-        frame::{RgbImage, RigFrame},
+        frame::{RgbImage, RigFrame, SideView, Sides},
         pose::Pose,
     },
     stages::localise::{LocaliseError, PlateFit, TOLERANCE_M, fit_plate},
@@ -482,6 +482,21 @@ impl Script {
                 if own.is_finite() && !hidden { 255 } else { 0 }
             })
             .collect()
+    }
+
+    /// The rig's side images of a capture with [`Views::Triple`], as the service gets them; `None` with another.
+    pub fn sides(&self, station: usize, capture: &Capture) -> Option<Sides> {
+        let rig = &self.stations[station].rig;
+        let (left, right) = capture.sides.as_ref()?;
+        let view = |shot: &Shot, middle_from_side| SideView {
+            image: shot.image.grey(),
+            intrinsics: rig.intrinsics,
+            middle_from_side,
+        };
+        Some(Sides {
+            left: view(left, rig.middle_from_left),
+            right: view(right, rig.middle_from_right),
+        })
     }
 
     /// The middle camera's pose as a robot gets it: from the tracked LEDs.

@@ -16,16 +16,22 @@ use std::{
 use image::{ExtendedColorType, ImageEncoder, codecs::jpeg::JpegEncoder, codecs::png::PngEncoder};
 
 use super::script::{Capture, Script, Views};
-use crate::model::pose::Pose;
+use crate::{
+    isa::Isa,
+    model::pose::Pose,
+    stages::depth::{InverseDepthRange, SidesDepth},
+};
 
 pub const DEPTH_UNITS_PER_METRE: f32 = 5000.0;
 
 /// What poses and depth are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Truth {
     /// As the robot has them: pose from the tracked LEDs, depth as measured. Frames whose LEDs do not give a pose are
     /// left out, as a robot would have to.
     Measured,
+    /// As a robot without a depth camera: the same pose, depth from its three cameras among these hypotheses.
+    Computed(InverseDepthRange),
     /// As they are; depth to the first surface, glass included.
     Exact,
 }
@@ -119,17 +125,28 @@ pub fn recording(dir: &Path, script: &Script, options: &Options) -> Result<Summa
         frames: 0,
         without_pose: 0,
     };
+    let (views, mut computed) = match options.truth {
+        Truth::Computed(range) => (Views::Triple, Some(SidesDepth::new(range, Isa::detect()))),
+        Truth::Measured | Truth::Exact => (Views::Middle, None),
+    };
     for frame in options.frames.clone().step_by(options.step as usize) {
-        let capture = script.capture(options.station, frame, Views::Middle);
-        let (world_from_camera, depth_m) = match options.truth {
-            Truth::Exact => (capture.world_from_camera, &capture.middle.depth_m),
-            Truth::Measured => match script.localised(options.station, &capture) {
-                Ok((pose, _)) => (pose, &capture.depth_m),
-                Err(_) => {
-                    summary.without_pose += 1;
-                    continue;
-                }
-            },
+        let capture = script.capture(options.station, frame, views);
+        let world_from_camera = if options.truth == Truth::Exact {
+            capture.world_from_camera
+        } else if let Ok((world_from_camera, _)) = script.localised(options.station, &capture) {
+            world_from_camera
+        } else {
+            summary.without_pose += 1;
+            continue;
+        };
+        let sides = script.sides(options.station, &capture);
+        let depth_m = match (&mut computed, &sides) {
+            (Some(computed), Some(sides)) => {
+                let image = capture.middle.image.grey();
+                &computed.compute(camera, &image, sides, None).depth_m
+            }
+            _ if options.truth == Truth::Exact => &capture.middle.depth_m,
+            _ => &capture.depth_m,
         };
         let stamp = stamp_text(capture.stamp_ns);
         write_images(dir, &stamp, &capture, depth_m, &names, options.jpeg_quality)?;

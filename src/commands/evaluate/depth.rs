@@ -13,7 +13,7 @@ use crate::{
     },
     pipeline::depth_range,
     simulation::script::Script,
-    stages::depth::{DepthSettings, InverseDepthRange},
+    stages::depth::DepthSettings,
 };
 
 /// In place of a folder.
@@ -32,13 +32,13 @@ pub fn run(what: &str, settings: &Settings, seed: u64, as_json: bool) -> anyhow:
         pool.install(|| simulated(settings, seed, as_json));
         Ok(())
     } else {
-        pool.install(|| stereo_folder(Path::new(what), as_json))
+        pool.install(|| stereo_folder(Path::new(what), settings.depth_labels, as_json))
     }
 }
 
-fn stereo_folder(folder: &Path, as_json: bool) -> anyhow::Result<()> {
+fn stereo_folder(folder: &Path, labels: usize, as_json: bool) -> anyhow::Result<()> {
     let scene = StereoScene::open(folder)?;
-    let range = disparities(&scene);
+    let range = scene.disparities(labels);
     let bad = |cameras| stereo::evaluate(&scene, DepthSettings::default(), cameras, &range);
     let (three, two) = (bad(Cameras::Three), bad(Cameras::Two));
     if as_json {
@@ -76,15 +76,6 @@ fn stereo_folder(folder: &Path, as_json: bool) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// From infinitely far to a little beyond the scene's greatest disparity, in half pixels: as is usual for such scenes,
-/// how near things come is told beforehand.
-fn disparities(scene: &StereoScene) -> InverseDepthRange {
-    let most = scene.disparity.iter().copied().fold(0.0, f32::max).ceil() + 2.0;
-    let labels = (2.0 * most) as usize + 1;
-    InverseDepthRange::new(0.0, f64::from(most), labels.min(255))
-        .expect("a scene knows some disparity")
-}
-
 fn simulated(settings: &Settings, seed: u64, as_json: bool) {
     let script = Script::tabletop(seed);
     let end = script.frames.unwrap_or(0);
@@ -100,7 +91,10 @@ fn simulated(settings: &Settings, seed: u64, as_json: bool) {
         "frames",
         "labels",
         "within one %",
+        "at centres %",
+        "mixed %",
         "cloth %",
+        "besides %",
         "glass %",
         "behind glass %",
         "no depth %",
@@ -110,7 +104,10 @@ fn simulated(settings: &Settings, seed: u64, as_json: bool) {
         within.frames.to_string(),
         within.labels.to_string(),
         number(within.within_one_label, 2),
+        number(within.within_one_label_at_centre, 2),
+        number(within.mixed, 2),
         number(within.cloth, 2),
+        number(within.besides_cloth, 2),
         number(within.glass, 2),
         number(within.behind_glass, 2),
         number(within.invalid, 2),

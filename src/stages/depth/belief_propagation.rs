@@ -85,6 +85,8 @@ pub struct BeliefPropagation {
     /// Finest first.
     levels: Vec<Level>,
     beliefs: Vec<Belief>,
+    /// Of the level above the finest.
+    coarse_beliefs: Vec<Belief>,
 }
 
 impl BeliefPropagation {
@@ -131,6 +133,7 @@ impl BeliefPropagation {
             isa: isa.or_best_available(),
             levels,
             beliefs: vec![Belief::default(); width * height],
+            coarse_beliefs: vec![Belief::default(); width.div_ceil(2) * height.div_ceil(2)],
         }
     }
 
@@ -148,6 +151,26 @@ impl BeliefPropagation {
     /// pixel's least, and what is far above it cut.
     pub fn fill<S>(
         &mut self,
+        highest_cost: u8,
+        init: impl Fn() -> S + Sync + Send,
+        fill_row: impl Fn(&mut S, usize, &mut CostRow<'_>) + Sync + Send,
+    ) {
+        self.fill_levels(true, highest_cost, init, fill_row);
+    }
+
+    /// As [`fill`](Self::fill), but for [`solve_coarse`](Self::solve_coarse) only: the finest level keeps its costs.
+    pub fn fill_coarse<S>(
+        &mut self,
+        highest_cost: u8,
+        init: impl Fn() -> S + Sync + Send,
+        fill_row: impl Fn(&mut S, usize, &mut CostRow<'_>) + Sync + Send,
+    ) {
+        self.fill_levels(false, highest_cost, init, fill_row);
+    }
+
+    fn fill_levels<S>(
+        &mut self,
+        with_finest: bool,
         highest_cost: u8,
         init: impl Fn() -> S + Sync + Send,
         fill_row: impl Fn(&mut S, usize, &mut CostRow<'_>) + Sync + Send,
@@ -172,6 +195,8 @@ impl BeliefPropagation {
                 levels.push(chunk);
             }
         }
+        // A row that is only summed up stays in the cache.
+        let passing = if with_finest { 0 } else { finest_row };
         let sums = || {
             boards
                 .iter()
@@ -179,10 +204,11 @@ impl BeliefPropagation {
                 .collect::<Vec<_>>()
         };
         strips.par_iter_mut().enumerate().for_each_init(
-            || (init(), sums()),
-            |(state, sums), (strip, (finest, levels))| {
+            || (init(), sums(), AlignedBytes::zeroed(passing)),
+            |(state, sums, passing), (strip, (finest, levels))| {
                 for (row, costs) in finest.chunks_exact_mut(finest_row).enumerate() {
                     let y = strip * rows + row;
+                    let costs = if with_finest { costs } else { &mut passing[..] };
                     fill_row(
                         state,
                         y,
@@ -198,7 +224,7 @@ impl BeliefPropagation {
                         let (a, b) = costs.split_at(finest_row / 2);
                         sum_into(isa, sums, boards[0].width, a, b, board.stride, y % 2 == 0);
                     }
-                    if cut {
+                    if cut && with_finest {
                         for half_row in costs.chunks_exact_mut(finest_row / 2) {
                             saturate(isa, half_row, board.stride, highest);
                         }
@@ -234,9 +260,18 @@ impl BeliefPropagation {
     /// their number.
     pub fn solve(&mut self) -> &[Belief] {
         for at in (0..self.levels.len()).rev() {
-            self.propagate(at);
+            self.propagate(at, at > 0);
         }
         &self.beliefs
+    }
+
+    /// Solves all levels but the finest: beliefs of 2x2 pixels each, row by row. Where there is but one level, all is
+    /// believed to be far.
+    pub fn solve_coarse(&mut self) -> &[Belief] {
+        for at in (1..self.levels.len()).rev() {
+            self.propagate(at, at > 1);
+        }
+        &self.coarse_beliefs
     }
 
     /// Of the last [`solve`](Self::solve).
@@ -244,13 +279,14 @@ impl BeliefPropagation {
         &self.beliefs
     }
 
-    /// All iterations of one level, and then what the next finer one or the caller gets.
-    fn propagate(&mut self, at: usize) {
+    /// All iterations of one level, and then what the next finer one gets if it is handed down, or the caller.
+    fn propagate(&mut self, at: usize, hand_down: bool) {
         let Self {
             settings,
             isa,
             levels,
             beliefs,
+            coarse_beliefs,
         } = self;
         let (finer, level) = levels.split_at_mut(at);
         let Level {
@@ -285,19 +321,20 @@ impl BeliefPropagation {
             iterations: settings.iterations,
             isa: *isa,
         };
-        let outputs: Vec<Output<'_>> = match finer.last_mut() {
-            None => beliefs
+        let outputs: Vec<Output<'_>> = if hand_down {
+            let finer = finer.last_mut().expect("a coarser level has a finer one");
+            let (labels, stride) = (finer.costs.labels, finer.costs.board.stride);
+            finer
+                .first
+                .chunks_mut(4 * labels * stride * rows)
+                .map(|first| Output::First { first, stride })
+                .collect()
+        } else {
+            let beliefs = if at == 0 { beliefs } else { coarse_beliefs };
+            beliefs
                 .chunks_mut(width * rows)
                 .map(Output::Beliefs)
-                .collect(),
-            Some(finer) => {
-                let (labels, stride) = (finer.costs.labels, finer.costs.board.stride);
-                finer
-                    .first
-                    .chunks_mut(4 * labels * stride * rows)
-                    .map(|first| Output::First { first, stride })
-                    .collect()
-            }
+                .collect()
         };
         rings
             .par_iter_mut()

@@ -1,0 +1,327 @@
+//! A side image, turned once a frame to the middle camera's axes and lens (its image of infinitely far points), so that
+//! a hypothesis only shifts it, and scales it if a side camera stands before or behind the middle one; and who stands
+//! in whose view of it.
+//! In: luminance of the side, its calibration, later a first answer. Out: the turned image with what blocks each pixel's
+//! view, and which of the middle's pixels it sees.
+
+use super::{
+    messages::Belief,
+    rig::{InverseDepthRange, SideCamera},
+};
+use crate::model::camera::Intrinsics;
+use nalgebra::{Matrix3, Vector3};
+use rayon::prelude::*;
+
+/// Blocks the view of every label: beyond the image.
+pub(super) const OUTSIDE: u8 = 255;
+
+/// A side image turned to the middle camera's axes and lens, with a margin on all sides.
+#[derive(Default)]
+pub(super) struct Side {
+    /// What the canvas was made for.
+    seen: Option<(Intrinsics, SideCamera, usize, usize)>,
+    /// Per pixel of the canvas: where in the side image, `None` outside; empty if the canvas is the image itself.
+    look_up: Vec<LookUp>,
+    /// Of the canvas, which begins `margin` pixels left of and `margin_rows` above the image.
+    pub width: usize,
+    pub margin: usize,
+    pub margin_rows: usize,
+    pub luminance: Vec<u8>,
+    /// [`OUTSIDE`] where there is no image, else 0.
+    outside: Vec<u8>,
+    /// The least label that is seen there past what is known to stand in front: `outside`, and nearest labels.
+    pub blocker: Vec<u8>,
+    pub motion: Motion,
+}
+
+#[derive(Clone, Copy)]
+struct LookUp {
+    /// Upper left of the four pixels; `u32::MAX` outside.
+    index: u32,
+    /// 1/16 pixel.
+    right: u8,
+    below: u8,
+}
+
+/// How a hypothesis moves the turned image: `x' - cx = (x - cx + rho * x_pixels) / (1 + rho * scale)`, likewise y.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Motion {
+    /// Pixel metres.
+    pub x: f64,
+    y: f64,
+    /// Metres.
+    z: f64,
+    cx: f64,
+    cy: f64,
+}
+
+impl Motion {
+    fn of(middle: &Intrinsics, side: &SideCamera) -> Self {
+        let t = side.side_from_middle.rotation.inverse() * side.side_from_middle.translation.vector;
+        Self {
+            x: middle.fx * t.x,
+            y: middle.fy * t.y,
+            z: t.z,
+            cx: middle.cx,
+            cy: middle.cy,
+        }
+    }
+
+    /// Scale, and where the pixel (0, 0) comes from.
+    pub fn at(&self, inverse_depth: f64) -> (f64, f64, f64) {
+        // A point at or behind the side camera is seen nowhere; a scale this great leads off any image.
+        let scale = 1.0 / (1.0 + inverse_depth * self.z).max(1e-3);
+        (
+            scale,
+            (inverse_depth * self.x - self.cx) * scale + self.cx,
+            (inverse_depth * self.y - self.cy) * scale + self.cy,
+        )
+    }
+
+    /// The image keeps its rows and its scale, to a fraction of a pixel that interpolation hides.
+    pub fn along_rows(&self, middle: &Intrinsics, range: &InverseDepthRange) -> bool {
+        let (scale, _, y) = self.at(range.near);
+        let stretch = (scale - 1.0).abs() * middle.width.max(middle.height) as f64;
+        stretch < 1.0 / 16.0 && y.abs() < 1.0 / 16.0
+    }
+}
+
+impl Side {
+    /// Takes the next image, `luminance` of the side camera's size.
+    pub fn turn(
+        &mut self,
+        middle: &Intrinsics,
+        side: &SideCamera,
+        range: &InverseDepthRange,
+        exposure: &[u8; 256],
+        luminance: &[u8],
+    ) {
+        self.motion = Motion::of(middle, side);
+        let reach = |size: usize, shift: &dyn Fn(&(f64, f64, f64)) -> f64| {
+            let reach = [range.far, range.near]
+                .map(|rho| {
+                    let (scale, ..) = self.motion.at(rho);
+                    let first = shift(&self.motion.at(rho));
+                    let last = first + (scale - 1.0) * size as f64;
+                    first.abs().max(last.abs())
+                })
+                .into_iter()
+                .fold(0.0, f64::max);
+            // Beyond its own width there is no image left to see.
+            (reach.ceil() as usize + 2).min(size + 2)
+        };
+        let margin = reach(middle.width, &|motion| motion.1);
+        let margin_rows = reach(middle.height, &|motion| motion.2);
+        let seen = Some((*middle, *side, margin, margin_rows));
+        let width = middle.width + 2 * margin;
+        let height = middle.height + 2 * margin_rows;
+        if self.seen != seen {
+            self.seen = seen;
+            (self.width, self.margin, self.margin_rows) = (width, margin, margin_rows);
+            self.luminance = vec![0; width * height];
+            self.outside = vec![OUTSIDE; width * height];
+            let same_lens = side.intrinsics == *middle;
+            self.look_up =
+                if same_lens && side.side_from_middle.rotation.angle() * middle.fx < 1.0 / 64.0 {
+                    Vec::new()
+                } else {
+                    look_up(middle, side, width, height, margin, margin_rows)
+                };
+            for (outside, look_up) in self.outside.iter_mut().zip(&self.look_up) {
+                *outside = if look_up.index == u32::MAX {
+                    OUTSIDE
+                } else {
+                    0
+                };
+            }
+        }
+        if self.look_up.is_empty() {
+            for (y, row) in luminance.chunks_exact(middle.width).enumerate() {
+                let at = (y + margin_rows) * width + margin;
+                self.outside[at..at + middle.width].fill(0);
+                for (to, from) in self.luminance[at..at + middle.width].iter_mut().zip(row) {
+                    *to = exposure[usize::from(*from)];
+                }
+            }
+            self.blocker.clone_from(&self.outside);
+            return;
+        }
+        self.blocker.clone_from(&self.outside);
+        let stride = side.intrinsics.width;
+        self.luminance
+            .par_chunks_exact_mut(width)
+            .zip(self.look_up.par_chunks_exact(width))
+            .for_each(|(row, look_up)| {
+                for (
+                    to,
+                    LookUp {
+                        index,
+                        right,
+                        below,
+                    },
+                ) in row.iter_mut().zip(look_up)
+                {
+                    if *index == u32::MAX {
+                        continue;
+                    }
+                    let at = *index as usize;
+                    let pixel = |offset: usize| {
+                        u32::from(luminance[(at + offset).min(luminance.len() - 1)])
+                    };
+                    let (right, below) = (u32::from(*right), u32::from(*below));
+                    let upper = pixel(0) * (16 - right) + pixel(1) * right;
+                    let lower = pixel(stride) * (16 - right) + pixel(stride + 1) * right;
+                    *to = exposure[((upper * (16 - below) + lower * below + 128) >> 8) as usize];
+                }
+            });
+    }
+}
+
+fn look_up(
+    middle: &Intrinsics,
+    side: &SideCamera,
+    width: usize,
+    height: usize,
+    margin: usize,
+    margin_rows: usize,
+) -> Vec<LookUp> {
+    let rotation: Matrix3<f64> = side
+        .side_from_middle
+        .rotation
+        .to_rotation_matrix()
+        .into_inner();
+    let camera = &side.intrinsics;
+    let mut table = Vec::with_capacity(width * height);
+    for y in 0..height {
+        for x in 0..width {
+            let ray = Vector3::new(
+                (x as f64 - margin as f64 - middle.cx) / middle.fx,
+                (y as f64 - margin_rows as f64 - middle.cy) / middle.fy,
+                1.0,
+            );
+            table.push(match camera.project(&(rotation * ray).into()) {
+                Some((u, v))
+                    if u >= 0.0
+                        && v >= 0.0
+                        && u <= camera.width as f64 - 1.0
+                        && v <= camera.height as f64 - 1.0 =>
+                {
+                    let sixteenths = |value: f64| (value * 16.0).round() as usize;
+                    let (u, v) = (sixteenths(u), sixteenths(v));
+                    LookUp {
+                        index: (v / 16 * camera.width + u / 16) as u32,
+                        right: (u % 16) as u8,
+                        below: (v % 16) as u8,
+                    }
+                }
+                _ => LookUp {
+                    index: u32::MAX,
+                    right: 0,
+                    below: 0,
+                },
+            });
+        }
+    }
+    table
+}
+
+/// Where a side sees the middle's pixels at one hypothesis, in its turned image.
+#[derive(Clone, Copy)]
+struct Placing {
+    scale: f32,
+    x: f32,
+    y: f32,
+}
+
+impl Side {
+    fn placings(&self, range: &InverseDepthRange) -> Vec<Placing> {
+        let placing = |label: usize| {
+            let (scale, x, y) = self.motion.at(range.inverse_depth(label as f64));
+            Placing {
+                scale: scale as f32,
+                x: (x + self.margin as f64 + 0.5) as f32,
+                y: (y + self.margin_rows as f64 + 0.5) as f32,
+            }
+        };
+        (0..range.labels).map(placing).collect()
+    }
+
+    /// Index on the canvas; `None` beyond it.
+    fn place(&self, placing: Placing, x: usize, y: usize) -> Option<usize> {
+        // Rounds, as what is added contains a half.
+        let u = (x as f32 * placing.scale + placing.x) as i32;
+        let v = (y as f32 * placing.scale + placing.y) as i32;
+        let at = v as usize * self.width + u as usize;
+        (u >= 0 && v >= 0 && u < self.width as i32 && at < self.blocker.len()).then_some(at)
+    }
+
+    /// A slanted surface puts neighbours up to a pixel apart in one place: only what is nearer by more labels than
+    /// these hides what is behind.
+    pub fn tolerance(&self, range: &InverseDepthRange) -> usize {
+        let labels = (1.0 / self.pixels_per_label(range)).min(range.labels as f64);
+        labels.ceil() as usize + 1
+    }
+
+    /// How far one label moves the middle of the image, on average.
+    pub fn pixels_per_label(&self, range: &InverseDepthRange) -> f64 {
+        let (far, near) = (self.motion.at(range.far), self.motion.at(range.near));
+        let centre = |(scale, x, y): (f64, f64, f64)| {
+            (scale * self.motion.cx + x, scale * self.motion.cy + y)
+        };
+        let ((x0, y0), (x1, y1)) = (centre(far), centre(near));
+        (x1 - x0).hypot(y1 - y0) / (range.labels - 1) as f64
+    }
+
+    /// Lets the middle's pixels block the view of what is behind them. One belief stands for `scale * scale` pixels.
+    pub fn block(
+        &mut self,
+        range: &InverseDepthRange,
+        beliefs: &[Belief],
+        middle: &Intrinsics,
+        scale: usize,
+    ) {
+        self.blocker.clone_from(&self.outside);
+        let placings = self.placings(range);
+        let columns = middle.width.div_ceil(scale);
+        for y in 0..middle.height {
+            let row = &beliefs[y / scale * columns..][..columns];
+            for (column, Belief { label, .. }) in row.iter().enumerate() {
+                let placing = placings[usize::from(*label)];
+                for x in column * scale..((column + 1) * scale).min(middle.width) {
+                    if let Some(at) = self.place(placing, x, y) {
+                        self.blocker[at] = self.blocker[at].max(*label);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Adds `bit` where nothing blocks the view of a pixel's label.
+    pub fn mark_seen(
+        &self,
+        range: &InverseDepthRange,
+        beliefs: &[Belief],
+        width: usize,
+        bit: u8,
+        seen_by: &mut [u8],
+    ) {
+        let placings = self.placings(range);
+        let tolerance = self.tolerance(range);
+        let rows = beliefs
+            .chunks_exact(width)
+            .zip(seen_by.chunks_exact_mut(width));
+        for (y, (beliefs, seen_by)) in rows.enumerate() {
+            for (x, (Belief { label, .. }, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
+                let label = usize::from(*label);
+                if let Some(at) = self.place(placings[label], x, y) {
+                    let passes = (label + tolerance).min(usize::from(OUTSIDE) - 1);
+                    *seen_by |= if usize::from(self.blocker[at]) <= passes {
+                        bit
+                    } else {
+                        0
+                    };
+                }
+            }
+        }
+    }
+}
