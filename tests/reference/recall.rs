@@ -62,7 +62,8 @@ pub fn views(random: &mut Random, disagreement: bool) -> Views {
                 if other {
                     belief.tau = [20.0, 40.0 + 3.0 * a as f32, 40.0];
                 }
-                if disagreement && b > 0.5 && index % 2 == 0 {
+                // The third was written over everywhere, so that no rounding decides what it speaks for.
+                if disagreement && (b > 0.5 || index == 2) && index % 2 == 0 {
                     belief.tau2 = [200.0 - 10.0 * a as f32, -40.0, 10.0];
                     belief.p2 = match index {
                         2 | 4 => 0.5,

@@ -25,6 +25,7 @@ const AREA_MIN: f64 = 0.05;
 const LEVEL: f64 = 1e-9;
 
 /// How a patch is to be drawn.
+#[expect(clippy::large_enum_variant, reason = "it is taken apart at once")]
 pub enum Drawable {
     /// It shows its back, whole.
     Hidden,
@@ -55,7 +56,7 @@ pub struct FlatPatch {
 
 impl FlatPatch {
     /// Of a mesh whose vertices land at `z * (H * (column, row, 1)) + h`.
-    pub fn new(
+    pub fn of(
         patch: &Patch,
         view: &Intrinsics,
         h_matrix: &Matrix3<f64>,

@@ -157,7 +157,7 @@ impl Reach {
         self.done
             .resize(blocks * mesh.intrinsics.height.div_ceil(PATCH_ROWS), false);
         for patch in &mesh.patches {
-            match FlatPatch::new(patch, &mesh.intrinsics, h_matrix, h_offset) {
+            match FlatPatch::of(patch, &mesh.intrinsics, h_matrix, h_offset) {
                 Drawable::ByTriangles => continue,
                 Drawable::Hidden => {}
                 Drawable::Flat(flat) => self.flat.push(flat),
