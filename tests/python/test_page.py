@@ -138,8 +138,8 @@ def test_an_object_that_is_put_down_is_boxed_and_listed_as_an_event(opened, demo
 
 def test_pointing_at_the_map_asks_what_the_memory_expects_there(opened):
     page = opened.page
-    robot = page.locator("#map .robot circle").first
-    box = robot.bounding_box()
+    page.locator("#map").scroll_into_view_if_needed()
+    box = page.locator("#map .robot circle").first.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.locator('#prior-answer[data-state="answered"]').wait_for()
     words = page.locator("#prior-words").inner_text()
