@@ -51,7 +51,7 @@ function update(item, place, event) {
   );
   facts(parts.facts, [
     ["Seen by", `${list(event.robots)}, ${count(event.sightings, "time")}`],
-    ["Strongest", nats(event.peak_surprise)],
+    event.kind === "change" && ["Strongest", nats(event.peak_surprise)],
     event.center && ["Where", at(event.center)],
   ]);
 }

@@ -71,6 +71,19 @@ function nearest(points, t) {
   return best && far(best) <= Math.max(GAP, seconds / 100) ? best : null;
 }
 
+/** When something was not as expected, without overlaps; and the event that is pointed at. */
+function changing(events) {
+  const spans = [];
+  for (const { event, from, to } of events) {
+    if (event.kind !== "change") continue;
+    const last = spans.at(-1);
+    if (last && from <= last.to) last.to = Math.max(last.to, to);
+    else spans.push({ from, to, pointed: false });
+  }
+  const pointed = events.find(({ event }) => event.id === store.pointed);
+  return pointed ? [...spans, { ...pointed, pointed: true }] : spans;
+}
+
 /** Each event gets the first lane that is free when it begins. */
 function lanes(events) {
   const ends = [];
@@ -130,18 +143,10 @@ export function drawTimeline(place) {
     );
     nodes.push(svg("text", { class: "tick", x: LEFT - 8, y: y(value) + 4, "text-anchor": "end" }, String(value)));
   }
-  for (const { event, from: begin, to } of events.filter(({ event }) => event.kind === "change")) {
+  for (const { from: begin, to, pointed } of changing(events)) {
     const left = Math.max(LEFT, x(begin));
-    nodes.push(
-      svg("rect", {
-        class: "during",
-        "data-pointed": store.pointed === event.id,
-        x: left,
-        y: TOP,
-        width: Math.max(1, x(to) - left),
-        height: CURVE,
-      }),
-    );
+    const width = Math.max(1, x(to) - left);
+    nodes.push(svg("rect", { class: "during", "data-pointed": pointed, x: left, y: TOP, width, height: CURVE }));
   }
   nodes.push(svg("line", { class: "limit", x1: LEFT, x2: width - RIGHT, y1: y(limit), y2: y(limit) }));
   nodes.push(

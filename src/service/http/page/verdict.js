@@ -88,7 +88,7 @@ export function drawVerdict(place) {
     byId("verdict-facts"),
     event
       ? [
-          ["Strongest", nats(event.peak_surprise)],
+          event.kind === "change" && ["Strongest", nats(event.peak_surprise)],
           ["Seen by", list(event.robots)],
           ["Last seen", clock(event.last_ms)],
           event.center && ["Where", at(event.center)],
