@@ -225,34 +225,44 @@ fn look_up(
     table
 }
 
-/// Where a side sees the middle's pixels at one hypothesis, in its turned image.
+/// Where a side sees the middle's pixels at one hypothesis, in its turned image, with
+/// [`FRACTION_BITS`] below a pixel.
 #[derive(Clone, Copy)]
 struct Placing {
-    scale: f32,
-    x: f32,
-    y: f32,
+    scale: i64,
+    x: i64,
+    y: i64,
 }
+
+/// Bits below a pixel: an image's size times the greatest scale fits above them.
+const FRACTION_BITS: u32 = 20;
 
 impl Side {
     fn placings(&self, range: &InverseDepthRange) -> Vec<Placing> {
+        let fixed = |value: f64| (value * f64::from(1_u32 << FRACTION_BITS)) as i64;
         let placing = |label: usize| {
             let (scale, x, y) = self.motion.at(range.inverse_depth(label as f64));
             Placing {
-                scale: scale as f32,
-                x: (x + self.margin as f64 + 0.5) as f32,
-                y: (y + self.margin_rows as f64 + 0.5) as f32,
+                scale: fixed(scale),
+                // What is cut off below a pixel is then rounded.
+                x: fixed(x + self.margin as f64 + 0.5),
+                y: fixed(y + self.margin_rows as f64 + 0.5),
             }
         };
         (0..range.labels).map(placing).collect()
     }
 
-    /// Index on the canvas; `None` beyond it.
-    fn place(&self, placing: Placing, x: usize, y: usize) -> Option<usize> {
-        // Rounds, as what is added contains a half.
-        let u = (x as f32 * placing.scale + placing.x) as i32;
-        let v = (y as f32 * placing.scale + placing.y) as i32;
-        let at = v as usize * self.width + u as usize;
-        (u >= 0 && v >= 0 && u < self.width as i32 && at < self.blocker.len()).then_some(at)
+    /// Where row `y` begins on the canvas; `None` beyond it.
+    fn place_row(&self, placing: Placing, y: usize) -> Option<usize> {
+        let row = (y as i64 * placing.scale + placing.y) >> FRACTION_BITS;
+        let at = usize::try_from(row).ok()? * self.width;
+        (at < self.blocker.len()).then_some(at)
+    }
+
+    /// Index on the canvas from a row's; `None` beyond it.
+    fn place(&self, row: usize, placing: Placing, x: usize) -> Option<usize> {
+        let column = (x as i64 * placing.scale + placing.x) >> FRACTION_BITS;
+        ((column as u64) < self.width as u64).then(|| row + column as usize)
     }
 
     /// A slanted surface puts neighbours up to a pixel apart in one place: only what is nearer by more labels than
@@ -287,8 +297,11 @@ impl Side {
             let row = &beliefs[y / scale * columns..][..columns];
             for (column, Belief { label, .. }) in row.iter().enumerate() {
                 let placing = placings[usize::from(*label)];
+                let Some(start) = self.place_row(placing, y) else {
+                    continue;
+                };
                 for x in column * scale..((column + 1) * scale).min(middle.width) {
-                    if let Some(at) = self.place(placing, x, y) {
+                    if let Some(at) = self.place(start, placing, x) {
                         self.blocker[at] = self.blocker[at].max(*label);
                     }
                 }
@@ -313,7 +326,10 @@ impl Side {
         for (y, (beliefs, seen_by)) in rows.enumerate() {
             for (x, (Belief { label, .. }, seen_by)) in beliefs.iter().zip(seen_by).enumerate() {
                 let label = usize::from(*label);
-                if let Some(at) = self.place(placings[label], x, y) {
+                let placing = placings[label];
+                if let Some(row) = self.place_row(placing, y)
+                    && let Some(at) = self.place(row, placing, x)
+                {
                     let passes = (label + tolerance).min(usize::from(OUTSIDE) - 1);
                     *seen_by |= if usize::from(self.blocker[at]) <= passes {
                         bit
