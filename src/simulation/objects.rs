@@ -362,7 +362,7 @@ impl Kind {
                         text: "COFFEE",
                         letter: 0.0165,
                         text_v: 0.098,
-                        repeat: std::f64::consts::PI * 0.05,
+                        repeat: std::f32::consts::PI * 0.05,
                         band_v: (0.118, 0.138),
                         seed: 8,
                     }),

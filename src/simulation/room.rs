@@ -106,10 +106,10 @@ pub fn room() -> Vec<Primitive> {
             51,
         ),
     ] {
-        let (width, height) = size;
+        let (width, height): (f64, f64) = size;
         let picture = Pattern::Picture {
-            width,
-            height,
+            width: width as f32,
+            height: height as f32,
             seed,
         };
         room.cuboid(center, [width, 0.03, height], yaw, matte(picture));

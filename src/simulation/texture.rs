@@ -2,8 +2,10 @@
 //!
 //! Colours are linear RGB. Detail finer than the `footprint` (metres on the surface) fades into its mean, so that
 //! textures neither flicker nor alias.
+//!
+//! Single precision; noise is evaluated for several points side by side.
 
-use nalgebra::Point3;
+use crate::{isa::for_each_isa, lanes::LANES};
 
 pub type Rgb = [f32; 3];
 
@@ -28,15 +30,36 @@ pub fn scaled(colour: Rgb, factor: f32) -> Rgb {
 }
 
 /// Where on a surface a colour is asked for.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub struct Spot {
     /// Metres, right and up on the surface.
-    pub u: f64,
-    pub v: f64,
-    pub part: usize,
-    pub point: Point3<f64>,
+    pub u: f32,
+    pub v: f32,
     /// Diameter of what a pixel covers, metres.
-    pub footprint: f64,
+    pub footprint: f32,
+}
+
+/// Several places on surfaces of one pattern.
+struct Spots<const N: usize> {
+    u: [f32; N],
+    v: [f32; N],
+    footprint: [f32; N],
+    /// The least footprint.
+    finest: f32,
+}
+
+impl<const N: usize> Spots<N> {
+    #[inline(always)]
+    fn new(spots: &[Spot; N]) -> Self {
+        Self {
+            u: spots.map(|spot| spot.u),
+            v: spots.map(|spot| spot.v),
+            footprint: spots.map(|spot| spot.footprint),
+            finest: spots
+                .iter()
+                .fold(f32::INFINITY, |finest, spot| finest.min(spot.footprint)),
+        }
+    }
 }
 
 #[derive(Debug, Clone)]
@@ -52,7 +75,7 @@ pub enum Pattern {
     Planks {
         light: Rgb,
         dark: Rgb,
-        width: f64,
+        width: f32,
         seed: u32,
     },
     /// Painted plaster below a patterned paper.
@@ -65,25 +88,25 @@ pub enum Pattern {
     Mottled {
         a: Rgb,
         b: Rgb,
-        size: f64,
+        size: f32,
         seed: u32,
     },
     /// Rings around an upright object, `period` metres.
     Rings {
         a: Rgb,
         b: Rgb,
-        period: f64,
+        period: f32,
         share_of_b: f32,
     },
     /// Knitted or woven stripes along v.
     Knit {
         a: Rgb,
         b: Rgb,
-        period: f64,
+        period: f32,
     },
     Picture {
-        width: f64,
-        height: f64,
+        width: f32,
+        height: f32,
         seed: u32,
     },
     Spine {
@@ -102,19 +125,19 @@ pub struct Label {
     pub ink: Rgb,
     pub text: &'static str,
     /// Height of a letter, metres.
-    pub letter: f64,
+    pub letter: f32,
     /// Height of the text's middle above the base, metres.
-    pub text_v: f64,
+    pub text_v: f32,
     /// Between the starts of neighbouring texts around the object, metres.
-    pub repeat: f64,
+    pub repeat: f32,
     /// The band lies between these heights; its edges are waves.
-    pub band_v: (f64, f64),
+    pub band_v: (f32, f32),
     pub seed: u32,
 }
 
 /// A coin-like hash of a grid point, 0..1.
-#[inline]
-fn hash(x: i64, y: i64, seed: u32) -> f32 {
+#[inline(always)]
+fn hash(x: i32, y: i32, seed: u32) -> f32 {
     let mut h = (x as u32)
         .wrapping_mul(0x9e37_79b1)
         .wrapping_add((y as u32).wrapping_mul(0x85eb_ca77))
@@ -122,42 +145,61 @@ fn hash(x: i64, y: i64, seed: u32) -> f32 {
     h = (h ^ (h >> 15)).wrapping_mul(0x2c1b_3c6d);
     h = (h ^ (h >> 12)).wrapping_mul(0x297a_2d39);
     h ^= h >> 15;
-    (h >> 8) as f32 * (1.0 / (1 << 24) as f32)
+    // Signed: vectors have no quick conversion of unsigned numbers before AVX-512.
+    (h >> 8) as i32 as f32 * (1.0 / (1 << 24) as f32)
 }
 
 /// Value noise of period 1, -1..1.
-#[inline]
-fn noise(x: f64, y: f64, seed: u32) -> f32 {
+#[inline(always)]
+fn noise(x: f32, y: f32, seed: u32) -> f32 {
     let (i, j) = (floor(x), floor(y));
-    let (column, row) = (i as f64, j as f64);
     let smooth = |t: f32| t * t * (3.0 - 2.0 * t);
-    let (s, t) = (smooth((x - column) as f32), smooth((y - row) as f32));
+    let (s, t) = (smooth(x - i as f32), smooth(y - j as f32));
     let top = hash(i, j, seed) * (1.0 - s) + hash(i + 1, j, seed) * s;
     let bottom = hash(i, j + 1, seed) * (1.0 - s) + hash(i + 1, j + 1, seed) * s;
     (top * (1.0 - t) + bottom * t) * 2.0 - 1.0
 }
 
-/// Without SSE4.1, `f64::floor` is a call into the C library.
-#[inline]
-fn floor(x: f64) -> i64 {
-    let whole = x as i64;
-    whole - i64::from(x < whole as f64)
+/// Without SSE4.1, `f32::floor` is a call into the C library.
+#[inline(always)]
+fn floor(x: f32) -> i32 {
+    let whole = x as i32;
+    whole - i32::from(x < whole as f32)
+}
+
+#[inline(always)]
+fn modulo(x: f32, period: f32) -> f32 {
+    x - floor(x / period) as f32 * period
 }
 
 /// How much of a detail of this size survives a pixel of that footprint, 0..1.
-fn kept(size: f64, footprint: f64) -> f32 {
-    ((size / footprint - 1.0) as f32).clamp(0.0, 1.0)
+#[inline(always)]
+fn kept(size: f32, footprint: f32) -> f32 {
+    (size / footprint - 1.0).clamp(0.0, 1.0)
 }
 
 /// Sum of noises from `size` downwards, each half as large and as strong; -1..1 about.
-fn clouds(u: f64, v: f64, size: f64, octaves: u32, footprint: f64, seed: u32) -> f32 {
-    let (mut sum, mut size, mut strength) = (0.0, size, 0.6);
+#[inline(always)]
+fn clouds<const N: usize>(
+    u: &[f32; N],
+    v: &[f32; N],
+    size: f32,
+    octaves: u32,
+    spots: &Spots<N>,
+    seed: u32,
+) -> [f32; N] {
+    let mut sum = [0.0; N];
+    let (mut size, mut strength) = (size, 0.6);
     for octave in 0..octaves {
-        let share = kept(size, footprint);
-        if share == 0.0 {
+        if kept(size, spots.finest) == 0.0 {
             break;
         }
-        sum += strength * share * noise(u / size, v / size, seed + octave);
+        let per_metre = size.recip();
+        for lane in 0..N {
+            sum[lane] += strength
+                * kept(size, spots.footprint[lane])
+                * noise(u[lane] * per_metre, v[lane] * per_metre, seed + octave);
+        }
         size *= 0.5;
         strength *= 0.55;
     }
@@ -165,18 +207,21 @@ fn clouds(u: f64, v: f64, size: f64, octaves: u32, footprint: f64, seed: u32) ->
 }
 
 /// 1 where `x > edge`, 0 where it is less, the covered share in between.
-fn above(x: f64, edge: f64, footprint: f64) -> f32 {
-    (((x - edge) / footprint + 0.5) as f32).clamp(0.0, 1.0)
+#[inline(always)]
+fn above(x: f32, edge: f32, footprint: f32) -> f32 {
+    ((x - edge) / footprint + 0.5).clamp(0.0, 1.0)
 }
 
-fn between(x: f64, low: f64, high: f64, footprint: f64) -> f32 {
+#[inline(always)]
+fn between(x: f32, low: f32, high: f32, footprint: f32) -> f32 {
     above(x, low, footprint) * (1.0 - above(x, high, footprint))
 }
 
 /// Stripes of unequal width in a strip pattern of 0.21 m, of strength 0..1.
-fn stripes(x: f64, footprint: f64, seed: u32) -> f32 {
-    const PERIOD: f64 = 0.21;
-    const LINES: [(f64, f64, f32); 6] = [
+#[inline(always)]
+fn stripes<const N: usize>(x: &[f32; N], spots: &Spots<N>, seed: u32) -> [f32; N] {
+    const PERIOD: f32 = 0.21;
+    const LINES: [(f32, f32, f32); 6] = [
         (0.010, 0.034, 0.85),
         (0.043, 0.049, 0.60),
         (0.084, 0.092, 0.45),
@@ -184,66 +229,91 @@ fn stripes(x: f64, footprint: f64, seed: u32) -> f32 {
         (0.156, 0.161, 0.90),
         (0.186, 0.191, 0.40),
     ];
-    let turn = floor(x / PERIOD);
-    let inside = x - turn as f64 * PERIOD;
-    LINES
-        .iter()
-        .zip(0..)
-        // A line is shifted by 6 mm at most.
-        .filter(|((low, high, _), _)| {
-            inside > low - 0.006 - footprint && inside < high + 0.006 + footprint
-        })
-        .map(|(&(low, high, strength), line)| {
-            let shift = f64::from(hash(turn, line, seed) - 0.5) * 0.012;
-            strength * between(inside, low + shift, high + shift, footprint)
-        })
-        .sum::<f32>()
-        .min(1.0)
+    let mut strengths = [0.0f32; N];
+    for (&(low, high, strength), line) in LINES.iter().zip(0..) {
+        for lane in 0..N {
+            let turn = floor(x[lane] * (1.0 / PERIOD));
+            let inside = x[lane] - turn as f32 * PERIOD;
+            let shift = (hash(turn, line, seed) - 0.5) * 0.012;
+            let cover = between(inside, low + shift, high + shift, spots.footprint[lane]);
+            strengths[lane] += strength * cover;
+        }
+    }
+    strengths.map(|strength| strength.min(1.0))
+}
+
+/// The complex number to this power.
+#[inline(always)]
+fn power((re, im): (f32, f32), exponent: u32) -> (f32, f32) {
+    (1..exponent).fold((re, im), |(a, b), _| (a * re - b * im, a * im + b * re))
+}
+
+/// Each spot's own share of work: what has branches that few spots enter.
+#[inline(always)]
+fn of_each<const N: usize>(spots: &Spots<N>, colour: impl Fn(usize, &Spot) -> Rgb) -> [Rgb; N] {
+    std::array::from_fn(|lane| {
+        colour(
+            lane,
+            &Spot {
+                u: spots.u[lane],
+                v: spots.v[lane],
+                footprint: spots.footprint[lane],
+            },
+        )
+    })
+}
+
+#[inline(always)]
+fn sums<const N: usize>(f: impl Fn(usize) -> f32) -> [f32; N] {
+    let mut values = [0.0; N];
+    for (lane, value) in values.iter_mut().enumerate() {
+        *value = f(lane);
+    }
+    values
+}
+
+for_each_isa! {
+    /// Linear RGB reflectance at several places.
+    pub fn colours(pattern: &Pattern, spots: &[Spot; LANES], colours: &mut [Rgb; LANES]) = colours_kernel;
+}
+
+#[inline(always)]
+fn colours_kernel(pattern: &Pattern, spots: &[Spot; LANES], colours: &mut [Rgb; LANES]) {
+    *colours = pattern.colours(&Spots::new(spots));
 }
 
 impl Pattern {
     /// Linear RGB reflectance.
     pub fn colour(&self, spot: &Spot) -> Rgb {
-        let Spot {
-            u, v, footprint, ..
-        } = *spot;
+        let [colour] = self.colours(&Spots::new(&[*spot]));
+        colour
+    }
+
+    #[inline(always)]
+    fn colours<const N: usize>(&self, spots: &Spots<N>) -> [Rgb; N] {
+        let Spots { u, v, .. } = spots;
         match self {
-            Self::Plain(colour) => *colour,
+            Self::Plain(colour) => [*colour; N],
             Self::Cloth {
                 ground,
                 warp,
                 weft,
                 seed,
             } => {
-                let fold = f64::from(clouds(u, v, 0.11, 1, footprint, seed + 9)) * 0.004;
-                let along = stripes(u + fold, footprint, *seed);
-                let across = stripes(v + fold * 0.7 + 0.05, footprint, seed + 1);
-                let colour = mixed(mixed(*ground, *warp, along * 0.8), *weft, across * 0.62);
-                // Embroidered dots in some of the tartan's fields.
-                let (i, j) = (floor(u / 0.07), floor(v / 0.07));
-                let (column, row) = (i as f64, j as f64);
-                let chosen = hash(i, j, seed + 4);
-                let colour = if chosen > 0.55 {
-                    let du = u - (column + 0.3 + f64::from(chosen) * 0.4) * 0.07;
-                    let dv = v - (row + 0.5) * 0.07;
-                    let radius = (du * du + dv * dv).sqrt();
-                    // Beyond its longest petals there is nothing of it.
-                    if radius < 0.013 + footprint {
-                        let petal = 0.009 + 0.004 * (5.0 * dv.atan2(du)).cos();
-                        let figure = 1.0 - above(radius, petal, footprint);
-                        let heart = 1.0 - above(radius, 0.004, footprint);
-                        let thread = mixed(*warp, rgb(0xc98a2b), f32::from(chosen > 0.78));
-                        mixed(mixed(colour, thread, figure * 0.9), rgb(0xf4e3b0), heart)
-                    } else {
-                        colour
-                    }
-                } else {
-                    colour
-                };
-                let grain = 1.0
-                    + 0.10 * clouds(u, v, 0.02, 2, footprint, seed + 2)
-                    + 0.05 * clouds(u, v, 0.2, 1, footprint, seed + 3);
-                scaled(colour, grain)
+                let fold = clouds(u, v, 0.11, 1, spots, seed + 9);
+                let along = stripes(&sums(|i| u[i] + fold[i] * 0.004), spots, *seed);
+                let across = stripes(&sums(|i| v[i] + fold[i] * 0.0028 + 0.05), spots, seed + 1);
+                let fine = clouds(u, v, 0.02, 2, spots, seed + 2);
+                let broad = clouds(u, v, 0.2, 1, spots, seed + 3);
+                of_each(spots, |lane, &Spot { u, v, footprint }| {
+                    let colour = mixed(
+                        mixed(*ground, *warp, along[lane] * 0.8),
+                        *weft,
+                        across[lane] * 0.62,
+                    );
+                    let colour = embroidered(colour, *warp, u, v, footprint, seed + 4);
+                    scaled(colour, 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane])
+                })
             }
             Self::Planks {
                 light,
@@ -251,118 +321,152 @@ impl Pattern {
                 width,
                 seed,
             } => {
-                let plank = (v / width).floor();
-                let lane = plank as i64;
-                let shift = f64::from(hash(lane, 0, *seed)) * 2.0;
-                let length = ((u + shift) / 1.3).floor();
-                let tint = hash(lane, length as i64, seed + 1);
-                let own = u + f64::from(tint) * 17.0;
-                let wave = f64::from(clouds(own, v, 0.25, 1, footprint, seed + 6)) * 0.02;
-                let grain = clouds(own * 0.12, v + wave, 0.016, 3, footprint, seed + 2)
-                    + 0.5 * clouds(own * 0.3, v, 0.07, 2, footprint, seed + 3);
-                let colour = mixed(
-                    *light,
-                    *dark,
-                    (0.25 + 0.4 * tint + 0.45 * grain).clamp(0.0, 1.0),
-                );
-                let gap = 0.0025;
-                let joint = between(v - plank * width, 0.0, gap, footprint)
-                    + between(u + shift - length * 1.3, 0.0, gap, footprint);
-                scaled(colour, 1.0 - 0.65 * joint.min(1.0))
+                let plank: [i32; N] = std::array::from_fn(|i| floor(v[i] / width));
+                let shift = sums::<N>(|i| hash(plank[i], 0, *seed) * 2.0);
+                let length: [i32; N] = std::array::from_fn(|i| floor((u[i] + shift[i]) / 1.3));
+                let tint = sums::<N>(|i| hash(plank[i], length[i], seed + 1));
+                let own = sums(|i| u[i] + tint[i] * 17.0);
+                let wave = clouds(&own, v, 0.25, 1, spots, seed + 6);
+                let waved = sums(|i| v[i] + wave[i] * 0.02);
+                let fine = clouds(&own.map(|u| u * 0.12), &waved, 0.016, 3, spots, seed + 2);
+                let broad = clouds(&own.map(|u| u * 0.3), v, 0.07, 2, spots, seed + 3);
+                of_each(spots, |lane, &Spot { u, v, footprint }| {
+                    let grain = fine[lane] + 0.5 * broad[lane];
+                    let share = (0.25 + 0.4 * tint[lane] + 0.45 * grain).clamp(0.0, 1.0);
+                    let across = v - plank[lane] as f32 * width;
+                    let along = u + shift[lane] - length[lane] as f32 * 1.3;
+                    let joint = |x: f32| between(x, 0.0, 0.0025, footprint);
+                    let joints = (joint(across) + joint(along)).min(1.0);
+                    scaled(mixed(*light, *dark, share), 1.0 - 0.65 * joints)
+                })
             }
             Self::Wallpaper {
                 ground,
                 figure,
                 seed,
             } => {
-                let (column, row) = ((u / 0.16).floor(), (v / 0.2).floor());
-                let odd = (column as i64).rem_euclid(2) as f64;
-                let row = if odd > 0.0 {
-                    ((v - 0.1) / 0.2).floor()
-                } else {
-                    row
-                };
-                let du = u - (column + 0.5) * 0.16;
-                let dv = v - (row + 0.5) * 0.2 - odd * 0.1;
-                let radius = (du * du + 0.64 * dv * dv).sqrt();
-                // Its longest petals reach 57 mm.
-                let shape = if radius < 0.057 + footprint {
-                    let angle = dv.atan2(du);
-                    let tilt = f64::from(hash(column as i64, row as i64, *seed)) * 6.0;
-                    let edge =
-                        0.035 + 0.016 * (5.0 * angle + tilt).cos() + 0.006 * (9.0 * angle).sin();
-                    between(radius, 0.012, edge, footprint)
-                } else {
-                    0.0
-                };
-                let stalk = if du.abs() < 0.015 + footprint {
-                    between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint)
-                } else {
-                    0.0
-                };
-                let colour = mixed(*ground, *figure, (0.75 * shape + 0.4 * stalk).min(0.85));
-                let grain = 1.0
-                    + 0.05 * clouds(u, v, 0.03, 2, footprint, seed + 2)
-                    + 0.09 * clouds(u, v, 0.5, 2, footprint, seed + 3);
-                scaled(colour, grain)
+                let fine = clouds(u, v, 0.03, 2, spots, seed + 2);
+                let broad = clouds(u, v, 0.5, 2, spots, seed + 3);
+                of_each(spots, |lane, spot| {
+                    let colour = mixed(*ground, *figure, blossom(spot, *seed));
+                    scaled(colour, 1.0 + 0.05 * fine[lane] + 0.09 * broad[lane])
+                })
             }
             Self::Mottled { a, b, size, seed } => {
-                let share = 0.5 + 0.7 * clouds(u, v, *size, 3, footprint, *seed);
-                mixed(*a, *b, share.clamp(0.0, 1.0))
+                let cloud = clouds(u, v, *size, 3, spots, *seed);
+                cloud.map(|cloud| mixed(*a, *b, (0.5 + 0.7 * cloud).clamp(0.0, 1.0)))
             }
             Self::Rings {
                 a,
                 b,
                 period,
                 share_of_b,
-            } => {
-                let x = spot.v.rem_euclid(*period);
-                let width = f64::from(*share_of_b) * period;
-                mixed(
-                    *a,
-                    *b,
-                    between(x, (period - width) * 0.5, (period + width) * 0.5, footprint),
-                )
-            }
+            } => of_each(spots, |_, &Spot { v, footprint, .. }| {
+                let x = modulo(v, *period);
+                let width = share_of_b * period;
+                let (low, high) = ((period - width) * 0.5, (period + width) * 0.5);
+                mixed(*a, *b, between(x, low, high, footprint))
+            }),
             Self::Knit { a, b, period } => {
-                let x = (v + 0.3 * period * f64::from(noise(u / period, v / period, 5)))
-                    .rem_euclid(*period);
-                let line = between(x, 0.0, period * 0.4, footprint);
-                let grain = 1.0
-                    + 0.16 * clouds(u, v, 0.012, 2, footprint, 31)
-                    + 0.2 * clouds(u, v, 0.09, 2, footprint, 32);
-                scaled(mixed(*a, *b, line), grain)
+                let sway = sums::<N>(|i| noise(u[i] / period, v[i] / period, 5));
+                let fine = clouds(u, v, 0.012, 2, spots, 31);
+                let broad = clouds(u, v, 0.09, 2, spots, 32);
+                of_each(spots, |lane, &Spot { v, footprint, .. }| {
+                    let x = modulo(v + 0.3 * period * sway[lane], *period);
+                    let line = between(x, 0.0, period * 0.4, footprint);
+                    let grain = 1.0 + 0.16 * fine[lane] + 0.2 * broad[lane];
+                    scaled(mixed(*a, *b, line), grain)
+                })
             }
             Self::Picture {
                 width,
                 height,
                 seed,
-            } => picture(spot, *width, *height, *seed),
-            Self::Spine { ground, ink, seed } => {
-                let title = f32::from(
-                    hash(
-                        (v / 0.006).floor() as i64,
-                        (u / 0.004).floor() as i64,
-                        seed + 1,
-                    ) > 0.45,
-                ) * between(v, 0.05, 0.13, footprint)
-                    * between(u, -0.007, 0.007, footprint)
-                    * kept(0.008, footprint);
-                let bands =
-                    between(v, 0.018, 0.026, footprint) + between(v, 0.150, 0.156, footprint);
-                let grain = 1.0 + 0.12 * clouds(u, v, 0.03, 2, footprint, *seed);
-                scaled(mixed(*ground, *ink, (title + bands).min(1.0) * 0.85), grain)
+            } => {
+                let brush = clouds(u, &v.map(|v| v * 2.5), 0.03, 2, spots, seed + 7);
+                of_each(spots, |lane, spot| {
+                    picture(spot, *width, *height, *seed, brush[lane])
+                })
             }
-            Self::Label(label) => label.colour(spot),
+            Self::Spine { ground, ink, seed } => {
+                let fine = clouds(u, v, 0.03, 2, spots, *seed);
+                of_each(spots, |lane, &Spot { u, v, footprint }| {
+                    let letter = hash(floor(v / 0.006), floor(u / 0.004), seed + 1) > 0.45;
+                    let title = f32::from(letter)
+                        * between(v, 0.05, 0.13, footprint)
+                        * between(u, -0.007, 0.007, footprint)
+                        * kept(0.008, footprint);
+                    let bands =
+                        between(v, 0.018, 0.026, footprint) + between(v, 0.150, 0.156, footprint);
+                    let inked = (title + bands).min(1.0) * 0.85;
+                    scaled(mixed(*ground, *ink, inked), 1.0 + 0.12 * fine[lane])
+                })
+            }
+            Self::Label(label) => of_each(spots, |_, spot| label.colour(spot)),
         }
     }
 }
 
-/// A painted landscape: sky, sun, hills and a field.
-fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
-    let Spot {
-        u, v, footprint, ..
-    } = *spot;
+/// Embroidered dots in some of the tartan's fields.
+fn embroidered(colour: Rgb, warp: Rgb, u: f32, v: f32, footprint: f32, seed: u32) -> Rgb {
+    let (i, j) = (floor(u / 0.07), floor(v / 0.07));
+    let chosen = hash(i, j, seed);
+    if chosen <= 0.55 {
+        return colour;
+    }
+    let du = u - (i as f32 + 0.3 + chosen * 0.4) * 0.07;
+    let dv = v - (j as f32 + 0.5) * 0.07;
+    let radius = (du * du + dv * dv).sqrt();
+    // Beyond its longest petals there is nothing of it.
+    if radius >= 0.013 + footprint {
+        return colour;
+    }
+    // The cosine of five times the angle.
+    let away = radius.max(1e-6);
+    let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
+    let figure = 1.0 - above(radius, petal, footprint);
+    let heart = 1.0 - above(radius, 0.004, footprint);
+    let thread = mixed(warp, rgb(0xc98a2b), f32::from(chosen > 0.78));
+    mixed(mixed(colour, thread, figure * 0.9), rgb(0xf4e3b0), heart)
+}
+
+/// How much of the wallpaper's figure, a flower on a stalk, is at a place.
+fn blossom(&Spot { u, v, footprint }: &Spot, seed: u32) -> f32 {
+    let column = floor(u / 0.16);
+    let odd = column.rem_euclid(2) as f32;
+    let row = floor((v - odd * 0.1) / 0.2);
+    let du = u - (column as f32 + 0.5) * 0.16;
+    let dv = v - (row as f32 + 0.5) * 0.2 - odd * 0.1;
+    let radius = (du * du + 0.64 * dv * dv).sqrt();
+    // Its longest petals reach 57 mm.
+    let shape = if radius < 0.057 + footprint {
+        let away = (du * du + dv * dv).sqrt().max(1e-6);
+        let towards = (du / away, dv / away);
+        let (tilt_sin, tilt_cos) = (hash(column, row, seed) * 6.0).sin_cos();
+        // cos(5 angle + tilt) and sin(9 angle).
+        let (cos5, sin5) = power(towards, 5);
+        let petals = cos5 * tilt_cos - sin5 * tilt_sin;
+        let edge = 0.035 + 0.016 * petals + 0.006 * power(towards, 9).1;
+        between(radius, 0.012, edge, footprint)
+    } else {
+        0.0
+    };
+    let stalk = if du.abs() < 0.015 + footprint {
+        between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint)
+    } else {
+        0.0
+    };
+    (0.75 * shape + 0.4 * stalk).min(0.85)
+}
+
+/// A painted landscape: sky, sun, hills and a field. `brush` is its strokes, -1..1.
+fn picture(
+    &Spot { u, v, footprint }: &Spot,
+    width: f32,
+    height: f32,
+    seed: u32,
+    brush: f32,
+) -> Rgb {
     let (x, y) = (u / width, v / height);
     let border = 0.025;
     if u.abs() > width * 0.5 - border || v < border || v > height - border {
@@ -375,7 +479,7 @@ fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
     let sky = mixed(
         rgb(0xf0d9a8),
         rgb(0x5f93b8),
-        (y as f32 * 1.4 - 0.4).clamp(0.0, 1.0),
+        (y * 1.4 - 0.4).clamp(0.0, 1.0),
     );
     let sun = 1.0
         - above(
@@ -384,7 +488,6 @@ fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
             footprint / width,
         );
     let mut colour = mixed(sky, rgb(0xfff3c4), sun);
-    let brush = 1.0 + 0.25 * clouds(u, v * 2.5, 0.03, 2, footprint, seed + 7);
     for (layer, (level, paint)) in [
         (0.55, 0x6d7fa0),
         (0.42, 0x4f7a58),
@@ -394,22 +497,20 @@ fn picture(spot: &Spot, width: f64, height: f64, seed: u32) -> Rgb {
     .into_iter()
     .enumerate()
     {
+        let layer = layer as f32;
         let hill = level
-            + 0.10 * f64::from(noise(x * 3.1, layer as f64 * 7.3, seed))
-            + 0.03 * f64::from(noise(x * 11.0, layer as f64 * 3.7, seed + 1));
+            + 0.10 * noise(x * 3.1, layer * 7.3, seed)
+            + 0.03 * noise(x * 11.0, layer * 3.7, seed + 1);
         colour = mixed(rgb(paint), colour, above(y, hill, footprint / height));
     }
-    scaled(colour, brush)
+    scaled(colour, 1.0 + 0.25 * brush)
 }
 
 impl Label {
-    fn colour(&self, spot: &Spot) -> Rgb {
-        let Spot {
-            u, v, footprint, ..
-        } = *spot;
-        let cell = (u / self.repeat).round();
-        let x = u - cell * self.repeat;
-        let wave = 0.004 * (x / self.repeat * std::f64::consts::TAU * 2.0).sin();
+    fn colour(&self, &Spot { u, v, footprint }: &Spot) -> Rgb {
+        let cell = floor(u / self.repeat + 0.5);
+        let x = u - cell as f32 * self.repeat;
+        let wave = 0.004 * (x / self.repeat * std::f32::consts::TAU * 2.0).sin();
         let band = between(v, self.band_v.0 + wave, self.band_v.1 + wave, footprint);
         let rim = between(
             v,
@@ -424,10 +525,10 @@ impl Label {
         let ring = between(emblem, self.letter * 0.45, self.letter * 0.6, footprint) + 1.0
             - above(emblem, self.letter * 0.25, footprint);
         colour = mixed(colour, self.ink, ring.min(1.0) * 0.9);
-        let line = ((v - 0.01) / 0.006).floor();
-        let print = f32::from(hash((u / 0.004).floor() as i64, line as i64, self.seed) > 0.4)
-            * f32::from((0.0..4.0).contains(&line))
-            * between((v - 0.01).rem_euclid(0.006), 0.0015, 0.0045, footprint)
+        let line = floor((v - 0.01) / 0.006);
+        let print = f32::from(hash(floor(u / 0.004), line, self.seed) > 0.4)
+            * f32::from((0..4).contains(&line))
+            * between(modulo(v - 0.01, 0.006), 0.0015, 0.0045, footprint)
             * between(x, -self.repeat * 0.3, self.repeat * 0.3, footprint);
         colour = mixed(colour, self.ink, print * 0.7);
         let ink = text_cover(self.text, x, v - self.text_v, self.letter, footprint);
@@ -436,15 +537,15 @@ impl Label {
 }
 
 /// Share of the pixel that letters cover; `(x, y)` metres from the text's middle.
-fn text_cover(text: &str, x: f64, y: f64, letter: f64, footprint: f64) -> f32 {
+fn text_cover(text: &str, x: f32, y: f32, letter: f32, footprint: f32) -> f32 {
     let dot = letter / 7.0;
-    let width = text.len() as f64 * 6.0 * dot;
+    let width = text.len() as f32 * 6.0 * dot;
     if x.abs() > width * 0.5 + footprint || y.abs() > letter * 0.5 + footprint {
         return 0.0;
     }
-    let set = |x: f64, y: f64| {
-        let column = ((x + width * 0.5) / dot).floor() as i64;
-        let row = ((letter * 0.5 - y) / dot).floor() as i64;
+    let set = |x: f32, y: f32| {
+        let column = floor((x + width * 0.5) / dot);
+        let row = floor((letter * 0.5 - y) / dot);
         if column < 0 || !(0..7).contains(&row) {
             return false;
         }
@@ -457,7 +558,7 @@ fn text_cover(text: &str, x: f64, y: f64, letter: f64, footprint: f64) -> f32 {
     // Sixteen samples of the footprint.
     let hits = (0..16)
         .filter(|i| {
-            let offset = |k: i32| (f64::from(k) + 0.5) / 4.0 - 0.5;
+            let offset = |k: i32| (k as f32 + 0.5) / 4.0 - 0.5;
             set(x + offset(i % 4) * footprint, y + offset(i / 4) * footprint)
         })
         .count();

@@ -16,7 +16,7 @@ use rayon::prelude::*;
 pub use self::{light::LitView, shade::refracted};
 use self::{
     light::{Lit, UNLIT},
-    shade::plus,
+    shade::{Paint, plus},
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
 use super::{
@@ -24,7 +24,10 @@ use super::{
     shapes::{Bounds, Ray},
     texture::{Rgb, scaled},
 };
-use crate::model::{camera::Intrinsics, pose::Pose};
+use crate::{
+    isa::Isa,
+    model::{camera::Intrinsics, pose::Pose},
+};
 
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
@@ -97,6 +100,7 @@ pub struct Tracer<'a> {
 #[derive(Default)]
 struct Scratch {
     casters: Vec<u32>,
+    paints: Vec<Option<Paint>>,
 }
 
 /// A ray on its way.
@@ -125,6 +129,8 @@ struct Near<'a> {
     view: Option<&'a LitView>,
     /// What may be in the light's way.
     tile: Option<&'a Tile>,
+    /// The surface itself.
+    paint: Option<Paint>,
 }
 
 /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
@@ -159,6 +165,7 @@ impl Tracer<'_> {
     ) -> (Rendering, LitView) {
         let width = camera.width;
         let pixels = camera.pixels();
+        let isa = Isa::detect();
         let prints = self.footprints(camera, world_from_camera);
         let mut rendering = Rendering {
             radiance: vec![[0.0; 3]; pixels],
@@ -224,11 +231,14 @@ impl Tracer<'_> {
                             }
                         }
                         self.light(&mut tile, &seen, beside, lit, width, scratch);
-                        for (at, path, cos, hit) in seen {
+                        let mut paints = std::mem::take(&mut scratch.paints);
+                        self.paint(isa, &seen, &mut paints);
+                        for ((at, path, cos, hit), &paint) in seen.into_iter().zip(&paints) {
                             let near = Near {
                                 lit: Some(lit[at]),
                                 view: beside,
                                 tile: None,
+                                paint,
                             };
                             radiance[at] = self.shade(&path, hit.as_ref(), near, scratch);
                             let Some(hit) = hit else {
@@ -247,6 +257,7 @@ impl Tracer<'_> {
                                 depth[at]
                             };
                         }
+                        scratch.paints = paints;
                         tiles.push(tile);
                     }
                     tiles
@@ -303,6 +314,7 @@ impl Tracer<'_> {
                             lit: None,
                             view: Some(&view),
                             tile: Some(tile),
+                            paint: None,
                         };
                         let colour = known.map_or_else(
                             || self.shade(&path, hit.as_ref(), near, scratch),

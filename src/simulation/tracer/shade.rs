@@ -2,16 +2,22 @@
 
 use nalgebra::{Point3, Vector3};
 
-use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit};
-use crate::simulation::{
-    scene::{Finish, Hit},
-    shapes::Ray,
-    texture::{Rgb, Spot, mixed, rgb, scaled},
+use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit, tiles::TILE};
+use crate::{
+    isa::Isa,
+    lanes::LANES,
+    simulation::{
+        scene::{Finish, Hit, Primitive},
+        shapes::Ray,
+        texture::{Rgb, Spot, colours, mixed, rgb, scaled},
+    },
 };
 
 const MAX_BOUNCES: u32 = 9;
 /// Mirrored light of a smaller part in the pixel is taken from the room at large.
 const FAINT: f32 = 0.045;
+/// Fewer points of a pattern are evaluated one by one.
+const FEW: usize = 3;
 
 /// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
 /// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
@@ -45,10 +51,106 @@ fn times(a: Rgb, b: Rgb) -> Rgb {
     std::array::from_fn(|i| a[i] * b[i])
 }
 
+/// A surface that is not glass, before light falls on it.
+#[derive(Clone, Copy)]
+pub(super) struct Paint {
+    /// Towards the eye.
+    normal: Vector3<f64>,
+    /// Of the angle between it and the ray.
+    cos: f64,
+    colour: Rgb,
+}
+
 impl Tracer<'_> {
+    /// The surface that each of a tile's rays meets. Its pattern is evaluated for many rays at once.
+    pub(super) fn paint(
+        &self,
+        isa: Isa,
+        seen: &[(usize, Path, f64, Option<Hit>)],
+        paints: &mut Vec<Option<Paint>>,
+    ) {
+        paints.clear();
+        let mut spots = [Spot::default(); TILE * TILE];
+        // Which rays wait for their colour.
+        let mut waiting = 0u64;
+        for (index, (_, path, _, hit)) in seen.iter().enumerate() {
+            let paint = hit.and_then(|hit| {
+                let primitive = &self.scene.primitives()[hit.primitive];
+                if primitive.is_glass() {
+                    return None;
+                }
+                let (normal, cos, spot) = Self::spot(primitive, path, &hit);
+                spots[index] = spot;
+                waiting |= 1 << index;
+                Some(Paint {
+                    normal,
+                    cos,
+                    colour: [0.0; 3],
+                })
+            });
+            paints.push(paint);
+        }
+        while waiting != 0 {
+            let first = waiting.trailing_zeros() as usize;
+            let primitive = |index: usize| seen[index].3.map(|hit| hit.primitive);
+            let (mut chosen, mut count) = ([first; LANES], 0);
+            let mut rest = waiting;
+            while rest != 0 && count < LANES {
+                let index = rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                if primitive(index) == primitive(first) {
+                    chosen[count] = index;
+                    count += 1;
+                    waiting &= !(1 << index);
+                }
+            }
+            let Some(primitive) = primitive(first) else {
+                continue;
+            };
+            let pattern = &self.scene.primitives()[primitive].material.pattern;
+            let mut found = [[0.0; 3]; LANES];
+            if count < FEW {
+                for (found, &index) in found.iter_mut().zip(&chosen[..count]) {
+                    *found = pattern.colour(&spots[index]);
+                }
+            } else {
+                colours(isa, pattern, &chosen.map(|index| spots[index]), &mut found);
+            }
+            for (&index, &colour) in chosen[..count].iter().zip(&found) {
+                if let Some(paint) = &mut paints[index] {
+                    paint.colour = colour;
+                }
+            }
+        }
+    }
+
+    /// Where a ray meets a surface: its normal on the ray's side, the cosine between them, and the place in its texture.
+    fn spot(primitive: &Primitive, path: &Path, hit: &Hit) -> (Vector3<f64>, f64, Spot) {
+        let point = path.ray.at(hit.crossing.t);
+        let surface = primitive.shape.surface(&point, hit.crossing.part);
+        let cos = -path.ray.direction.dot(&surface.normal);
+        let (normal, cos) = if cos < 0.0 {
+            (-surface.normal, -cos)
+        } else {
+            (surface.normal, cos)
+        };
+        let travelled = path.travelled + hit.crossing.t;
+        let spot = Spot {
+            u: surface.u as f32,
+            v: surface.v as f32,
+            // Between the short and the long side of the pixel's oblique print.
+            footprint: (travelled * path.spread / cos.max(0.1).sqrt()) as f32,
+        };
+        (normal, cos, spot)
+    }
+
     fn trace(&self, path: &Path, near: Near, scratch: &mut Scratch) -> Rgb {
         let hit = self.scene.nearest(&path.ray, LIFT, f64::INFINITY, |_| true);
-        let near = Near { lit: None, ..near };
+        let near = Near {
+            lit: None,
+            paint: None,
+            ..near
+        };
         self.shade(path, hit.as_ref(), near, scratch)
     }
 
@@ -158,22 +260,19 @@ impl Tracer<'_> {
         let primitive = &self.scene.primitives()[hit.primitive];
         let direction = path.ray.direction;
         let point = path.ray.at(hit.crossing.t);
-        let surface = primitive.shape.surface(&point, hit.crossing.part);
-        let cos = -direction.dot(&surface.normal);
-        let (normal, cos) = if cos < 0.0 {
-            (-surface.normal, -cos)
-        } else {
-            (surface.normal, cos)
-        };
-        let travelled = path.travelled + hit.crossing.t;
-        let colour = primitive.material.pattern.colour(&Spot {
-            u: surface.u,
-            v: surface.v,
-            part: surface.part,
-            point,
-            // Between the short and the long side of the pixel's oblique print.
-            footprint: travelled * path.spread / cos.max(0.1).sqrt(),
+        let Paint {
+            normal,
+            cos,
+            colour,
+        } = near.paint.unwrap_or_else(|| {
+            let (normal, cos, spot) = Self::spot(primitive, path, hit);
+            Paint {
+                normal,
+                cos,
+                colour: primitive.material.pattern.colour(&spot),
+            }
         });
+        let travelled = path.travelled + hit.crossing.t;
         let lighting = self.lighting;
         let up = (0.5 + 0.5 * normal.z) as f32;
         let (towards, window) = &lighting.window;
