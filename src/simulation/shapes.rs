@@ -385,19 +385,29 @@ impl Shape {
         }
     }
 
+    /// The outward normal at a point that [`Self::crossing`] found: [`Self::surface`] without its texture.
+    pub fn normal(&self, point: &Point3<f64>, part: usize) -> Vector3<f64> {
+        match self {
+            Self::Sphere(sphere) => (point - sphere.center) / sphere.radius,
+            Self::Ellipsoid(ellipsoid) => {
+                let on_unit = ellipsoid.unit_from_world * (point - ellipsoid.center);
+                (ellipsoid.unit_from_world.transpose() * on_unit).normalize()
+            }
+            Self::Frustum(frustum) => frustum.normal(point, part),
+            Self::Disc(disc) => disc.normal,
+            Self::Solid(solid) => solid.planes[part].0,
+        }
+    }
+
     /// The surface at a point that [`Self::crossing`] found.
     pub fn surface(&self, point: &Point3<f64>, part: usize) -> Surface {
         match self {
-            Self::Sphere(sphere) => {
-                let normal = (point - sphere.center) / sphere.radius;
-                around(normal, sphere.radius)
-            }
+            Self::Sphere(sphere) => around(self.normal(point, part), sphere.radius),
             Self::Ellipsoid(ellipsoid) => {
                 let on_unit = ellipsoid.unit_from_world * (point - ellipsoid.center);
-                let surface = around(on_unit, ellipsoid.half.max());
                 Surface {
-                    normal: (ellipsoid.unit_from_world.transpose() * on_unit).normalize(),
-                    ..surface
+                    normal: self.normal(point, part),
+                    ..around(on_unit, ellipsoid.half.max())
                 }
             }
             Self::Frustum(frustum) => frustum.surface(point, part),
@@ -504,24 +514,33 @@ impl Frustum {
         .min_by(|a, b| a.t.total_cmp(&b.t))
     }
 
+    fn normal(&self, point: &Point3<f64>, part: usize) -> Vector3<f64> {
+        match part {
+            0 => {
+                let offset = point - self.base;
+                let outward = offset - self.axis * offset.dot(&self.axis);
+                (outward / outward.norm() - self.axis * self.taper).normalize()
+            }
+            1 => -self.axis,
+            _ => self.axis,
+        }
+    }
+
     fn surface(&self, point: &Point3<f64>, part: usize) -> Surface {
         let offset = point - self.base;
         let (x, y) = (offset.dot(&self.right), offset.dot(&self.forward));
-        let height = offset.dot(&self.axis);
-        if part != 0 {
-            let normal = if part == 1 { -self.axis } else { self.axis };
-            return Surface {
-                normal,
-                u: x,
-                v: y,
-                part,
-            };
-        }
-        let outward = (self.right * x + self.forward * y) / x.hypot(y);
+        let (u, v) = if part == 0 {
+            (
+                y.atan2(x) * 0.5 * (self.base_radius + self.top_radius),
+                offset.dot(&self.axis),
+            )
+        } else {
+            (x, y)
+        };
         Surface {
-            normal: (outward - self.axis * self.taper).normalize(),
-            u: y.atan2(x) * 0.5 * (self.base_radius + self.top_radius),
-            v: height,
+            normal: self.normal(point, part),
+            u,
+            v,
             part,
         }
     }

@@ -5,6 +5,8 @@
 //!
 //! Single precision; noise is evaluated for several points side by side.
 
+use std::sync::LazyLock;
+
 use crate::{isa::for_each_isa, lanes::LANES};
 
 pub type Rgb = [f32; 3];
@@ -426,8 +428,10 @@ fn embroidered(colour: Rgb, warp: Rgb, u: f32, v: f32, footprint: f32, seed: u32
     let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
     let figure = 1.0 - above(radius, petal, footprint);
     let heart = 1.0 - above(radius, 0.004, footprint);
-    let thread = mixed(warp, rgb(0xc98a2b), f32::from(chosen > 0.78));
-    mixed(mixed(colour, thread, figure * 0.9), rgb(0xf4e3b0), heart)
+    static YARNS: LazyLock<[Rgb; 2]> = LazyLock::new(|| [rgb(0xc98a2b), rgb(0xf4e3b0)]);
+    let [gold, cream] = *YARNS;
+    let thread = mixed(warp, gold, f32::from(chosen > 0.78));
+    mixed(mixed(colour, thread, figure * 0.9), cream, heart)
 }
 
 /// How much of the wallpaper's figure, a flower on a stalk, is at a place.
@@ -467,41 +471,43 @@ fn picture(
     seed: u32,
     brush: f32,
 ) -> Rgb {
+    /// Frame, sky and sun.
+    static PAINTS: LazyLock<[Rgb; 5]> =
+        LazyLock::new(|| [0x4a2f1a, 0x8a6237, 0xf0d9a8, 0x5f93b8, 0xfff3c4].map(rgb));
+    /// The far hills first: how high they reach, and their colours.
+    static HILLS: LazyLock<[(f32, Rgb); 4]> = LazyLock::new(|| {
+        [
+            (0.55, 0x6d7fa0),
+            (0.42, 0x4f7a58),
+            (0.28, 0x9aa04a),
+            (0.14, 0xb8763a),
+        ]
+        .map(|(level, paint)| (level, rgb(paint)))
+    });
+    let [dark_wood, light_wood, low_sky, high_sky, sun_paint] = *PAINTS;
     let (x, y) = (u / width, v / height);
     let border = 0.025;
     if u.abs() > width * 0.5 - border || v < border || v > height - border {
         return mixed(
-            rgb(0x4a2f1a),
-            rgb(0x8a6237),
+            dark_wood,
+            light_wood,
             0.5 + 0.5 * noise(u / 0.01, v / 0.05, seed),
         );
     }
-    let sky = mixed(
-        rgb(0xf0d9a8),
-        rgb(0x5f93b8),
-        (y * 1.4 - 0.4).clamp(0.0, 1.0),
-    );
+    let sky = mixed(low_sky, high_sky, (y * 1.4 - 0.4).clamp(0.0, 1.0));
     let sun = 1.0
         - above(
             (x - 0.18).hypot((y - 0.72) * height / width),
             0.07,
             footprint / width,
         );
-    let mut colour = mixed(sky, rgb(0xfff3c4), sun);
-    for (layer, (level, paint)) in [
-        (0.55, 0x6d7fa0),
-        (0.42, 0x4f7a58),
-        (0.28, 0x9aa04a),
-        (0.14, 0xb8763a),
-    ]
-    .into_iter()
-    .enumerate()
-    {
+    let mut colour = mixed(sky, sun_paint, sun);
+    for (layer, &(level, paint)) in HILLS.iter().enumerate() {
         let layer = layer as f32;
         let hill = level
             + 0.10 * noise(x * 3.1, layer * 7.3, seed)
             + 0.03 * noise(x * 11.0, layer * 3.7, seed + 1);
-        colour = mixed(rgb(paint), colour, above(y, hill, footprint / height));
+        colour = mixed(paint, colour, above(y, hill, footprint / height));
     }
     scaled(colour, 1.0 + 0.25 * brush)
 }

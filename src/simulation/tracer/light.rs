@@ -3,7 +3,7 @@
 //! In: a point on a surface. Out: two shares, 0..1. Both are sampled; a tile looks for them at as few of its points as
 //! their differences allow.
 
-use nalgebra::{Point3, Vector3};
+use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::{
     LIFT, Path, Scratch, Tracer,
@@ -45,7 +45,9 @@ pub struct LitView {
     pub(super) lit: Vec<Lit>,
     depth_m: Vec<f32>,
     camera: Intrinsics,
-    camera_from_world: Pose,
+    eye: Point3<f64>,
+    /// Of the world: turns and scales it to `(u, v, 1)` times depth.
+    pixels_from_world: Matrix3<f64>,
 }
 
 /// Depths that differ by more, relative to themselves, are not of one place on a face.
@@ -60,28 +62,38 @@ impl LitView {
         camera: Intrinsics,
         world_from_camera: &Pose,
     ) -> Self {
+        let pixels_from_camera = Matrix3::new(
+            camera.fx, 0.0, camera.cx, //
+            0.0, camera.fy, camera.cy, //
+            0.0, 0.0, 1.0,
+        );
         Self {
             lit,
             depth_m,
             camera,
-            camera_from_world: world_from_camera.inverse(),
+            eye: Point3::from(world_from_camera.translation.vector),
+            pixels_from_world: pixels_from_camera
+                * world_from_camera.rotation.inverse().to_rotation_matrix(),
         }
     }
 
     /// The light on a point, if the camera sees the place: from the pixels around it that show the same face.
     pub(super) fn light_at(&self, hit: &Hit, point: &Point3<f64>) -> Option<Lit> {
-        let in_camera = self.camera_from_world * point;
-        if in_camera.z <= 0.0 {
+        let scaled = self.pixels_from_world * (point - self.eye);
+        let depth_m = scaled.z;
+        if depth_m <= 0.0 {
             return None;
         }
-        let (u, v) = self.camera.project(&in_camera)?;
+        let nearness = depth_m.recip();
+        let (u, v) = (scaled.x * nearness, scaled.y * nearness);
         let Intrinsics { width, height, .. } = self.camera;
         // Also false for what is not a number.
         let inside = u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64;
         if !inside {
             return None;
         }
-        let (column, row) = (u as usize, v as usize);
+        // Of 32 bits, signed: the quickest conversion that truncates.
+        let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
         let face = (hit.primitive, hit.crossing.part);
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
@@ -94,8 +106,8 @@ impl LitView {
                 }
                 let at = row * width + column;
                 let lit = &self.lit[at];
-                let apart = (f64::from(self.depth_m[at]) - in_camera.z).abs();
-                if lit.face == face && apart < SAME_DEPTH * in_camera.z {
+                let apart = (f64::from(self.depth_m[at]) - depth_m).abs();
+                if lit.face == face && apart < SAME_DEPTH * depth_m {
                     weight += near;
                     sky += near * lit.sky;
                     lamp += near * lit.lamp;
@@ -331,13 +343,9 @@ impl Tracer<'_> {
             };
         }
         let point = path.ray.at(hit.crossing.t);
-        let surface = primitive.shape.surface(&point, hit.crossing.part);
-        let facing = path.ray.direction.dot(&surface.normal) < 0.0;
-        let normal = if facing {
-            surface.normal
-        } else {
-            -surface.normal
-        };
+        let outward = primitive.shape.normal(&point, hit.crossing.part);
+        let facing = path.ray.direction.dot(&outward) < 0.0;
+        let normal = if facing { outward } else { -outward };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
         // Seen in a mirror or through glass, fewer samples do.
         let few = path.few || path.bounces > 0;

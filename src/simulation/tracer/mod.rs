@@ -133,21 +133,48 @@ struct Near<'a> {
     paint: Option<Paint>,
 }
 
+/// Where a camera's rays start and what is added to their direction for each pixel.
+struct Eye {
+    origin: Point3<f64>,
+    /// Through image position (0, 0); unit depth.
+    corner: Vector3<f64>,
+    across: Vector3<f64>,
+    down: Vector3<f64>,
+}
+
+impl Eye {
+    fn new(camera: &Intrinsics, world_from_camera: &Pose) -> Self {
+        let rotation = world_from_camera.rotation;
+        Self {
+            origin: Point3::from(world_from_camera.translation.vector),
+            corner: rotation * camera.unproject(0.0, 0.0, 1.0).coords,
+            across: rotation * Vector3::new(1.0 / camera.fx, 0.0, 0.0),
+            down: rotation * Vector3::new(0.0, 1.0 / camera.fy, 0.0),
+        }
+    }
+
+    /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
+    fn ray(&self, u: f64, v: f64) -> (Ray, f64) {
+        let direction = self.corner + self.across * u + self.down * v;
+        let cos = direction.norm().recip();
+        let ray = Ray {
+            origin: self.origin,
+            direction: direction * cos,
+        };
+        (ray, cos)
+    }
+}
+
 /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
 pub fn camera_ray(camera: &Intrinsics, world_from_camera: &Pose, u: f64, v: f64) -> (Ray, f64) {
-    let in_camera = camera.unproject(u, v, 1.0).coords;
-    let length = in_camera.norm();
-    let ray = Ray {
-        origin: Point3::from(world_from_camera.translation.vector),
-        direction: world_from_camera.rotation * (in_camera / length),
-    };
-    (ray, 1.0 / length)
+    Eye::new(camera, world_from_camera).ray(u, v)
 }
 
 /// A number in 0..1 that differs between neighbouring pixels like noise.
 fn twist_of(column: usize, row: usize) -> f64 {
-    // Jimenez's interleaved gradient noise.
-    (52.982_918_9 * (0.067_110_56 * column as f64 + 0.005_837_15 * row as f64).fract()).fract()
+    // Jimenez's interleaved gradient noise. Without SSE4.1, `f64::fract` is a call into the C library.
+    let fraction = |x: f64| x - (x as i32 as f64);
+    fraction(52.982_918_9 * fraction(0.067_110_56 * column as f64 + 0.005_837_15 * row as f64))
 }
 
 impl Tracer<'_> {
@@ -174,8 +201,9 @@ impl Tracer<'_> {
             object: vec![ObjectId::ROOM; pixels],
         };
         let mut lit = vec![UNLIT; pixels];
+        let eye = Eye::new(camera, world_from_camera);
         let path = |u: f64, v: f64, twist: f64, few: bool| {
-            let (ray, cos) = camera_ray(camera, world_from_camera, u, v);
+            let (ray, cos) = eye.ray(u, v);
             let path = Path {
                 ray,
                 bounces: 0,
@@ -226,7 +254,7 @@ impl Tracer<'_> {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
                                 let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
-                                let hit = self.first(&path.ray, &tile);
+                                let hit = self.first(&path.ray, &tile, u, v);
                                 seen.push((row * width + column, path, cos, hit));
                             }
                         }
@@ -294,7 +322,7 @@ impl Tracer<'_> {
                     let share = 1.0 / (offsets.len() + 1) as f32;
                     let mut sum = scaled(*radiance, share);
                     for (index, &(du, dv)) in offsets.iter().enumerate() {
-                        let twist = (twist_of(column, row) + index as f64 * 0.23).fract();
+                        let twist = twist_of(column, row) + index as f64 * 0.23;
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         // Where there is no glass, what is seen here is seen at one of these pixels.
                         let hit = if clear {
@@ -302,7 +330,7 @@ impl Tracer<'_> {
                         } else {
                             None
                         }
-                        .or_else(|| self.first(&path.ray, tile));
+                        .or_else(|| self.first(&path.ray, tile, column, row));
                         // What the pixel or one beside it shows of the same face: its texture and light are averaged
                         // over a pixel already, and do not differ much.
                         let known = hit.and_then(|hit| {
@@ -369,9 +397,10 @@ pub fn depth_alone(
         bounds.joined(&primitive.shape.bounds())
     });
     let [columns, rows] = window_of(&bounds, camera, &world_from_camera.inverse());
+    let eye = Eye::new(camera, world_from_camera);
     for row in rows {
         for column in columns.clone() {
-            let (ray, cos) = camera_ray(camera, world_from_camera, column as f64, row as f64);
+            let (ray, cos) = eye.ray(column as f64, row as f64);
             depth[row * camera.width + column] = primitives
                 .iter()
                 .filter_map(|primitive| primitive.shape.crossing(&ray, LIFT, f64::INFINITY))

@@ -1,5 +1,7 @@
 //! The colour that a ray brings back: what is matte, varnished, or glass, and what these mirror.
 
+use std::sync::LazyLock;
+
 use nalgebra::{Point3, Vector3};
 
 use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit, tiles::TILE};
@@ -179,8 +181,10 @@ impl Tracer<'_> {
 
     /// What is beyond everything: the ceiling with the lamp, and the rest of the room behind the robot.
     fn surroundings(&self, direction: &Vector3<f64>) -> Rgb {
+        static WALL: LazyLock<[Rgb; 2]> = LazyLock::new(|| [rgb(0x8f8577), rgb(0xd8d2c4)]);
         let up = direction.z as f32;
-        let wall = mixed(rgb(0x8f8577), rgb(0xd8d2c4), (up * 2.0).clamp(0.0, 1.0));
+        let [low, high] = *WALL;
+        let wall = mixed(low, high, (up * 2.0).clamp(0.0, 1.0));
         scaled(wall, 0.55 + 0.25 * up.max(0.0))
     }
 
@@ -207,7 +211,7 @@ impl Tracer<'_> {
         let primitive = &self.scene.primitives()[hit.primitive];
         let direction = path.ray.direction;
         let point = path.ray.at(hit.crossing.t);
-        let outward = primitive.shape.surface(&point, hit.crossing.part).normal
+        let outward = primitive.shape.normal(&point, hit.crossing.part)
             * if primitive.hollow { -1.0 } else { 1.0 };
         let entering = direction.dot(&outward) < 0.0;
         let (normal, ratio) = if entering {

@@ -17,6 +17,7 @@ use crate::{
 pub(super) const TILE: usize = 8;
 
 /// Pixels that a primitive's bounds cover, columns and rows, and how near they come.
+#[derive(Clone)]
 pub(super) struct Footprint {
     pub(super) primitive: usize,
     pub(super) window: [Range<usize>; 2],
@@ -29,8 +30,8 @@ pub(super) fn overlap(a: &Range<usize>, b: &Range<usize>) -> bool {
 
 /// What matters in a square of pixels.
 pub(super) struct Tile {
-    /// Primitives that may be seen there and the least distance at which they may be, nearest first.
-    pub(super) seen: Vec<(usize, f64)>,
+    /// What may be seen there, nearest first.
+    pub(super) seen: Vec<Footprint>,
     /// Holds every point seen through a pixel's centre.
     pub(super) reach: Bounds,
     /// What may hide the lamp, or some of the sky, from points in `reach`.
@@ -47,9 +48,14 @@ impl Tile {
         let mut seen: Vec<_> = band
             .iter()
             .filter(|print| overlap(&print.window[0], columns))
-            .filter_map(|print| Some((print.primitive, nearest_m(print)?)))
+            .filter_map(|&print| {
+                Some(Footprint {
+                    nearest_m: nearest_m(print)?,
+                    ..print.clone()
+                })
+            })
             .collect();
-        seen.sort_by(|a, b| a.1.total_cmp(&b.1));
+        seen.sort_by(|a, b| a.nearest_m.total_cmp(&b.nearest_m));
         Self {
             seen,
             reach: Bounds::EMPTY,
@@ -206,14 +212,18 @@ impl Tracer<'_> {
         best
     }
 
-    /// The nearest hit of a ray through the tile.
-    pub(super) fn first(&self, ray: &Ray, tile: &Tile) -> Option<Hit> {
+    /// The nearest hit of a ray through this pixel of the tile.
+    pub(super) fn first(&self, ray: &Ray, tile: &Tile, column: usize, row: usize) -> Option<Hit> {
         let mut best: Option<Hit> = None;
         let mut t_max = f64::INFINITY;
-        for &(primitive, nearest_m) in &tile.seen {
-            if nearest_m > t_max {
+        for print in &tile.seen {
+            if print.nearest_m > t_max {
                 break;
             }
+            if !print.window[0].contains(&column) || !print.window[1].contains(&row) {
+                continue;
+            }
+            let primitive = print.primitive;
             let shape = &self.scene.primitives()[primitive].shape;
             if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
                 t_max = crossing.t;
