@@ -66,16 +66,16 @@ pub fn views(random: &mut Random, disagreement: bool) -> Views {
                 if disagreement && (b > 0.5 || index == 2) && index % 2 == 0 {
                     belief.tau2 = [200.0 - 10.0 * a as f32, -40.0, 10.0];
                     belief.p2 = match index {
-                        2 | 4 => 0.5,
+                        2 | 6 => 0.5,
                         _ => (0.3 + 0.2 * a) as f32,
                     };
                 }
                 records.push(Record::pack(&belief));
             }
             weights.push(match (disagreement, index) {
-                (true, 1) => (0.2, true),
-                (true, 2) => (0.4, true),
-                (true, 3 | 4) => (0.6, true),
+                (true, 2) => (0.2, true),
+                (true, 3) => (0.6, true),
+                (true, 6) => (0.8, true),
                 _ => (1.0, false),
             });
             viewpoint(camera, &world_from_camera, depth_m, records)
