@@ -57,7 +57,8 @@ impl Robot {
     pub fn try_see(&mut self, scene: &Scene, step: usize) -> Result<Report, FrameError> {
         self.sequence += 1;
         let world_from_camera = pose(
-            [0.03 * step as f64, 0.0, 0.0],
+            // No whole number of steps is as far as views are looked for.
+            [0.033 * step as f64, 0.0, 0.0],
             [0.0, -0.01 * step as f64, 0.0],
         );
         let frame = scene.frame(&camera(165, 123), &world_from_camera, self.sequence);
@@ -75,7 +76,8 @@ pub fn assert_same_report(got: &Report, expected: &Report) -> usize {
         got.max_surprise,
         expected.max_surprise
     );
-    assert!((got.mean_surprise - expected.mean_surprise).abs() < 0.01);
+    let mean_tolerance = 0.05 * expected.mean_surprise.max(0.5);
+    assert!((got.mean_surprise - expected.mean_surprise).abs() <= mean_tolerance);
     assert!((got.coverage - expected.coverage).abs() < 0.005);
     // Views lie in equal steps, so the last digits of the refined pose say which of two is nearer.
     let sorted = |report: &Report| {

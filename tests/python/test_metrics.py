@@ -2,7 +2,7 @@
 
 import pytest
 import scene
-from daemon import ask, prior_request, refusal
+from daemon import ask, await_condition, prior_request, refusal
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from surprised_proto import PriorRequest
 
@@ -31,6 +31,11 @@ def value(families, sample: str, **labels) -> float:
 def test_frames_are_counted_by_what_became_of_them(scrape, place, settled):
     settled.put(b"no frame at all")
     settled.expect_rejection()
+    # The status follows the report.
+    await_condition(
+        "the rejection is counted",
+        lambda: value(scrape(), "surprised_frames_rejected_total", place=place, reason="undecodable") == 1,
+    )
     families = scrape()
     assert value(families, "surprised_frames_received_total", place=place) == 9
     assert value(families, "surprised_frames_processed_total", place=place) == 8
@@ -47,10 +52,16 @@ def test_frames_are_counted_by_what_became_of_them(scrape, place, settled):
 def test_lost_frames_are_counted(scrape, place, settled):
     settled.sequence += 5
     settled.show()
-    assert value(scrape(), "surprised_frames_dropped_total", place=place, reason="lost") == 5
+    await_condition(
+        "the gap is counted",
+        lambda: value(scrape(), "surprised_frames_dropped_total", place=place, reason="lost") == 5,
+    )
 
 
 def test_every_part_of_a_frames_way_is_timed(scrape, place, settled):
+    await_condition(
+        "the last frame is timed", lambda: value(scrape(), "surprised_frame_seconds_count", place=place) == 8
+    )
     families = scrape()
     parts = 0.0
     for stage in ("decode", "depth", "refine", "compare", "attend", "remember", "publish"):
@@ -63,9 +74,11 @@ def test_every_part_of_a_frames_way_is_timed(scrape, place, settled):
 
 def test_queries_are_counted_by_kind_and_outcome(scrape, session, place, settled):
     def count(kind, outcome):
+        # Nothing is told before the first.
+        queries = scrape().get("surprised_queries")
         return sum(
             sample.value
-            for sample in scrape()["surprised_queries"].samples
+            for sample in (queries.samples if queries else [])
             if sample.labels == {"kind": kind, "outcome": outcome}
         )
 
@@ -79,9 +92,18 @@ def test_queries_are_counted_by_kind_and_outcome(scrape, session, place, settled
 def test_events_and_the_engine_are_told(scrape, place, settled):
     for _ in range(2):
         settled.show(scene.BOX)
+    labels = {"place": place, "kind": "change", "state": "new"}
+    await_condition(
+        "the event is counted",
+        lambda: any(
+            sample.labels == labels and sample.value == 1
+            for family in scrape().values()
+            for sample in family.samples
+            if sample.name == "surprised_events_total"
+        )
+        and value(scrape(), "surprised_events_open", place=place) >= 1,
+    )
     families = scrape()
-    assert value(families, "surprised_events_total", place=place, kind="change", state="new") == 1
-    assert value(families, "surprised_events_open", place=place) >= 1
     engines = [sample for sample in families["surprised_engine"].samples if sample.labels["place"] == place]
     assert len(engines) == 1 and engines[0].labels["engine"] and engines[0].value == 1
     for queue in ("frames", "poses", "asks"):

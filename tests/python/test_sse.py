@@ -112,7 +112,9 @@ def test_a_watcher_that_never_reads_costs_no_frame_and_is_counted(own_daemon):
         for _ in range(300):
             for robot in robots:
                 robot.show()
-        assert own_daemon.fetch_json("/api/v1/places/kitchen")["frames"] == 1200
+        await_condition(
+            "every frame is counted", lambda: own_daemon.fetch_json("/api/v1/places/kitchen")["frames"] == 1200
+        )
         with Stream(own_daemon) as stream:
             stream.next("hello")
     await_condition(

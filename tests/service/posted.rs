@@ -102,7 +102,7 @@ async fn a_posted_frame_is_evaluated_and_not_learnt() {
         "{report}"
     );
     assert_eq!(report["place"], "lab");
-    assert!(report.get("learned").is_none(), "nothing was learnt");
+    assert_eq!(report["learned"], false, "nothing was learnt");
 
     let page = send_json(&rig, path, encode::json(&borrowing)).await;
     assert_eq!(page.json()["code"], "no_calibration");

@@ -244,6 +244,18 @@ fn described(description: openapi::OpenApi) -> Value {
     for (name, schema) in message::schemas() {
         schemas[name] = schema;
     }
+    // Every answer must have a description; that of a plain success is its operation's summary.
+    let paths = description["paths"].as_object_mut().into_iter().flatten();
+    let operations = paths.flat_map(|(_, path)| path.as_object_mut().into_iter().flatten());
+    for (_, operation) in operations {
+        let summary = operation["summary"].clone();
+        let responses = operation["responses"].as_object_mut().into_iter().flatten();
+        for (_, response) in responses {
+            if response["description"].is_null() {
+                response["description"] = summary.clone();
+            }
+        }
+    }
     description
 }
 
