@@ -68,7 +68,7 @@ export class Picture {
     this.missed = null;
     this.busy = false;
     this.after_ms = 0;
-    this.canvas = el("canvas", { role: "img", width: 320, height: 240 });
+    this.canvas = el("canvas", { role: "img", "aria-label": "No picture yet", width: 320, height: 240 });
     this.boxes = svg("svg", { class: "boxes", "aria-hidden": "true", preserveAspectRatio: "none" });
     this.wait = el("p", { class: "wait" }, "waiting for a frame");
     const { title, scale } = KINDS[kind];
