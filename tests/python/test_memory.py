@@ -5,6 +5,7 @@ import os
 import random
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -13,7 +14,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from daemon import BINARY, Daemon, Robot, await_condition, free_port, open_session, remembered
+from daemon import BINARY, Daemon, Robot, await_condition, open_session, remembered
 
 KILLS = 6
 # The promise is the last two seconds; nothing is learnt here for longer before it is looked for.
@@ -177,21 +178,35 @@ def test_a_memory_that_is_no_url_is_a_wrong_configuration():
     assert result.returncode == 64 and "file:///" in result.stderr, result
 
 
+def unasked_ports(count: int) -> list[int]:
+    """Free ports, each with a free one ten thousand above, that the system gives to nobody who asks for any port: they
+    are still free when a server that uses them starts a second time."""
+    ports = []
+    for port in random.sample(range(10_000, 22_000), 12_000):
+        try:
+            for taken in (port, port + 10_000):
+                with socket.socket() as listener:
+                    listener.bind(("127.0.0.1", taken))
+        except OSError:
+            continue
+        ports.append(port)
+        if len(ports) == count:
+            return ports
+    raise AssertionError("no free ports")
+
+
 class Weed:
     """SeaweedFS on loopback."""
 
     def __init__(self, program: str, folder: Path):
-        self.ports = []
-        while len(self.ports) < 4:
-            # Each has a second port ten thousand above.
-            if (port := free_port()) < 55_000:
-                self.ports.append(port)
+        self.ports = unasked_ports(4)
         self.command = [
             program, "server", f"-dir={folder}", "-ip=127.0.0.1", "-ip.bind=127.0.0.1", "-s3",
             "-volume.max=10", "-master.volumeSizeLimitMB=64",
         ]  # fmt: skip
         names = ("s3", "master", "volume", "filer")
         self.command += [f"-{name}.port={port}" for name, port in zip(names, self.ports, strict=True)]
+        self.log = folder / "log"
         self.start()
 
     @property
@@ -199,14 +214,17 @@ class Weed:
         return f"http://127.0.0.1:{self.ports[0]}"
 
     def start(self) -> None:
-        self.process = subprocess.Popen(self.command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        with self.log.open("ab") as log:
+            self.process = subprocess.Popen(self.command, stdout=log, stderr=log)
         end = time.monotonic() + 90
-        while not all(self._put(path) for path in ("/surprised", "/surprised/ready")):
-            assert time.monotonic() < end, "SeaweedFS does not come up"
+        # The first object with content takes seconds longer than the bucket: a volume is made for it.
+        while not all(self._put(path, data) for path, data in (("/surprised", b""), ("/surprised/ready", b"yes"))):
+            assert self.process.poll() is None, f"SeaweedFS ended with {self.process.returncode}: {self.log.read_text()}"
+            assert time.monotonic() < end, f"SeaweedFS does not come up: {self.log.read_text()}"
             time.sleep(0.1)
 
-    def _put(self, path: str) -> bool:
-        request = urllib.request.Request(self.endpoint + path, data=b"", method="PUT")
+    def _put(self, path: str, data: bytes) -> bool:
+        request = urllib.request.Request(self.endpoint + path, data=data, method="PUT")
         try:
             return urllib.request.urlopen(request, timeout=5).status == 200
         except urllib.error.HTTPError as error:
