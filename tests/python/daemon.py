@@ -41,13 +41,13 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-def await_condition(what: str, condition, within_s: float = DEADLINE_S):
+def await_condition(what: str, condition, within_s: float = DEADLINE_S, every_s: float = 0.02):
     """The first true value of `condition()`."""
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         if value := condition():
             return value
-        time.sleep(0.02)
+        time.sleep(every_s)
     raise AssertionError(f"not within {within_s} s: {what}")
 
 
