@@ -30,7 +30,7 @@ use super::{
     App,
     extract::Path,
     message as described,
-    problem::{Document, Problem},
+    problem::{Problem, Unanswered},
 };
 use crate::{
     model::refusal::Refusal,
@@ -146,10 +146,7 @@ fn sent(media_type: &'static str, bytes: Vec<u8>, room: Option<OwnedSemaphorePer
     request_body = described::PriorRequest,
     responses(
         (status = 200, content((described::PriorReply = "application/json"), (Vec<u8> = "image/png"))),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn prior(
     State(app): State<App>,
@@ -193,10 +190,7 @@ struct Borrowed {
     request_body = described::EvaluateRequest,
     responses(
         (status = 200, body = described::EvaluateReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn evaluate(
     State(app): State<App>,
@@ -232,10 +226,7 @@ async fn evaluate(
     request_body = described::NextViewRequest,
     responses(
         (status = 200, body = described::NextViewReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn next_view(
     State(app): State<App>,
@@ -256,10 +247,7 @@ async fn next_view(
     request_body = described::ForgetRequest,
     responses(
         (status = 200, body = described::ForgetReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn forget(
     State(app): State<App>,
@@ -288,10 +276,7 @@ struct Page {
     params(("place" = String, Path), Page),
     responses(
         (status = 200, body = described::ViewsReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn views(
     State(app): State<App>,
@@ -313,10 +298,7 @@ async fn views(
     params(("place" = String, Path)),
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn place_mode(
     State(app): State<App>,
@@ -333,10 +315,7 @@ async fn place_mode(
     request_body = described::Mode,
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn set_place_mode(
     State(app): State<App>,
@@ -361,10 +340,7 @@ fn camera_path(place: &str, robot: &str, camera: &str) -> Result<CameraPath, Pro
     params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn camera_mode(
     State(app): State<App>,
@@ -382,10 +358,7 @@ async fn camera_mode(
     request_body = described::Mode,
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn set_camera_mode(
     State(app): State<App>,

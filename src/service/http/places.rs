@@ -15,7 +15,7 @@ use super::{
     App,
     extract::Path,
     message,
-    problem::{Document, Problem},
+    problem::{Document, Problem, Refused},
 };
 use crate::{
     model::frame::{RgbImage, Source},
@@ -41,8 +41,7 @@ pub struct PlaceNames {
 #[utoipa::path(get, path = "/api/v1/places", tag = "places",
     responses(
         (status = 200, body = PlaceNames),
-        (status = "4XX", description = "No token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn list(State(app): State<App>) -> axum::Json<PlaceNames> {
     let places = app.parts.places.all();
@@ -66,8 +65,7 @@ pub fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
     params(("place" = String, Path)),
     responses(
         (status = 200, body = PlaceState),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn status(
     State(app): State<App>,
@@ -90,8 +88,7 @@ pub struct CameraReply {
     params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
     responses(
         (status = 200, body = CameraReply),
-        (status = "4XX", description = "No such camera, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn camera(
     State(app): State<App>,

@@ -21,7 +21,7 @@ use super::{
     extract::{Path, Query},
     message,
     places::known,
-    problem::{Document, Problem},
+    problem::{Document, Problem, Refused},
 };
 use crate::{
     service::{
@@ -263,8 +263,7 @@ pub struct EventList {
     params(("place" = String, Path), Wanted),
     responses(
         (status = 200, body = EventList),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn events(
     State(app): State<App>,
@@ -313,8 +312,7 @@ fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> 
     params(("place" = String, Path), ("event" = String, Path)),
     responses(
         (status = 200, body = message::Event),
-        (status = "4XX", description = "No such event, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn event(
     State(app): State<App>,
@@ -329,8 +327,7 @@ pub async fn event(
         ("picture" = String, Path, description = "seen.jpg or expected.jpg")),
     responses(
         (status = 200, body = Vec<u8>, content_type = "image/jpeg"),
-        (status = "4XX", description = "No such picture, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn event_picture(
     State(app): State<App>,
@@ -360,8 +357,7 @@ pub struct Timeline {
     params(("place" = String, Path)),
     responses(
         (status = 200, body = Timeline),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn timeline(
     State(app): State<App>,
