@@ -156,7 +156,7 @@ async fn prior(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (mut request, _room): (proto::PriorRequest, _) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     if !names(&headers, header::ACCEPT, PNG) {
         let Held { reply: prior, room } = questions.prior(&place, &request).await?;
         return Ok(reply(&headers, &prior, room));
@@ -202,7 +202,7 @@ async fn evaluate(
     let Query(Borrowed { robot, camera }) =
         borrowed.map_err(|_| bad("robot and camera are names"))?;
     let camera = camera_named(&robot, &camera)?;
-    let place = questions.place(&name)?;
+    let place = questions.places.known(&name).await?;
     let (head, body) = request.into_parts();
     // Room is made before the body is read: some of these are large.
     let length = head.headers.get(header::CONTENT_LENGTH);
@@ -236,7 +236,7 @@ async fn next_view(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (request, _room) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let ranked = questions.next_view(&place, &request).await?;
     Ok(reply(&headers, &ranked, None))
 }
@@ -257,7 +257,7 @@ async fn forget(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (request, _room) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let forgotten = questions.forget(&place, &request).await?;
     Ok(reply(&headers, &forgotten, None))
 }
@@ -287,7 +287,7 @@ async fn views(
     let Query(Page { after, limit }) =
         page.map_err(|_| bad("after and limit are whole numbers"))?;
     let questions = &app.parts.questions;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let request = proto::ViewsRequest { after, limit };
     let views = questions.views(&place, &request).await?;
     Ok(reply(&headers, &views, None))

@@ -105,7 +105,7 @@ impl Problem {
 impl From<Refusal> for Problem {
     fn from(refusal: Refusal) -> Self {
         let status = match refusal.code {
-            "busy" | "closing" => StatusCode::SERVICE_UNAVAILABLE,
+            "busy" | "closing" | "memory_unread" => StatusCode::SERVICE_UNAVAILABLE,
             "late" => StatusCode::GATEWAY_TIMEOUT,
             "unknown_camera" | "unknown_place" => StatusCode::NOT_FOUND,
             "message_too_large" => StatusCode::PAYLOAD_TOO_LARGE,

@@ -278,7 +278,7 @@ pub async fn events(
             format!("limit is between 1 and {LIST_MAX}"),
         ));
     }
-    let place = known(&app, &place)?;
+    let place = known(&app, &place).await?;
     // Before the list: what comes in between is in both.
     let last_event_id = app.parts.live.last_event_id();
     let events = place.events.borrow().clone();
@@ -297,8 +297,8 @@ pub async fn events(
     })))
 }
 
-fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> {
-    let events = known(app, place)?.events.borrow().clone();
+async fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> {
+    let events = known(app, place).await?.events.borrow().clone();
     let event = id.parse().ok().and_then(|id| events.get(id));
     event.cloned().ok_or_else(|| {
         Problem::not_found(
@@ -318,7 +318,9 @@ pub async fn event(
     State(app): State<App>,
     Path((place, id)): Path<(String, String)>,
 ) -> Result<axum::Json<Value>, Problem> {
-    Ok(axum::Json(encode::event_json(&*find(&app, &place, &id)?)))
+    Ok(axum::Json(encode::event_json(
+        &*find(&app, &place, &id).await?,
+    )))
 }
 
 /// An event's box and its surroundings at its peak
@@ -333,7 +335,7 @@ pub async fn event_picture(
     State(app): State<App>,
     Path((place, id, picture)): Path<(String, String, String)>,
 ) -> Result<Response, Problem> {
-    let event = find(&app, &place, &id)?;
+    let event = find(&app, &place, &id).await?;
     let image = match picture.as_str() {
         "seen.jpg" => event.picture.as_ref(),
         "expected.jpg" => event.expected_picture.as_ref(),
@@ -363,7 +365,7 @@ pub async fn timeline(
     State(app): State<App>,
     Path(place): Path<String>,
 ) -> Result<axum::Json<Timeline>, Problem> {
-    known(&app, &place)?;
+    known(&app, &place).await?;
     Ok(axum::Json(Timeline {
         cameras: app.parts.live.timeline(&place),
         seconds_per_point: 1,
