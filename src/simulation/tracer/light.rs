@@ -6,7 +6,7 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::{
-    LIFT, Path, Scratch, Tracer,
+    LIFT, Path, Scratch, Seen, Tracer,
     tiles::{TILE, Tile},
 };
 use crate::{
@@ -29,12 +29,18 @@ const GLASS_SHADOW: f32 = 0.9;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
 
+/// Primitive and part.
+pub(super) type Face = (u32, u32);
+
+pub(super) fn face_of(hit: &Hit) -> Face {
+    (hit.primitive as u32, hit.crossing.part as u32)
+}
+
 /// How much of the sky and of the lamp a point on a surface sees, 0..1. Light changes slowly over a surface, so
 /// neighbouring pixels on the same face of the same primitive share it.
 #[derive(Clone, Copy)]
 pub(super) struct Lit {
-    /// Primitive and part.
-    pub(super) face: (usize, usize),
+    pub(super) face: Face,
     pub(super) sky: f32,
     pub(super) lamp: f32,
 }
@@ -95,7 +101,7 @@ impl LitView {
         // Of 32 bits, signed: the quickest conversion that truncates.
         let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
-        let face = (hit.primitive, hit.crossing.part);
+        let face = face_of(hit);
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
         for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
             for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
@@ -124,7 +130,7 @@ impl LitView {
 
 /// Nothing, or glass, which has no light of its own.
 pub(super) const UNLIT: Lit = Lit {
-    face: (usize::MAX, 0),
+    face: (u32::MAX, 0),
     sky: 1.0,
     lamp: 1.0,
 };
@@ -164,7 +170,7 @@ fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 /// `enough` and they differ by less than `lamp_range` and `sky_range`.
 fn shared(
     known: &[[Option<Lit>; TILE]; TILE],
-    face: (usize, usize),
+    face: Face,
     (column, row): (usize, usize),
     reach: usize,
     enough: usize,
@@ -229,7 +235,7 @@ fn in_beam(
 
 impl Tracer<'_> {
     /// Finds what may shade any of the points that a tile sees.
-    fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
+    fn look_around(&self, tile: &mut Tile, seen: &[Seen]) {
         tile.reach = Bounds::of(
             seen.iter()
                 .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
@@ -265,7 +271,7 @@ impl Tracer<'_> {
     pub(super) fn light(
         &self,
         tile: &mut Tile,
-        seen: &[(usize, Path, f64, Option<Hit>)],
+        seen: &[Seen],
         beside: Option<&LitView>,
         lit: &mut [Lit],
         width: usize,
@@ -275,6 +281,17 @@ impl Tracer<'_> {
             return;
         };
         let place = |at: usize| (at % width - origin % width, at / width - origin / width);
+        self.look_around(tile, seen);
+        let tile = &*tile;
+        if tile.lamp.is_empty() && tile.sky.is_empty() {
+            // Nothing is in the light's way: a point sees all of the lamp, or is turned away from it.
+            for (at, path, _, hit) in seen {
+                if let Some(hit) = hit {
+                    lit[*at] = self.light_on(path, hit, Some(tile), scratch);
+                }
+            }
+            return;
+        }
         let mut known = [[None::<Lit>; TILE]; TILE];
         if let Some(beside) = beside {
             let mut all = true;
@@ -294,8 +311,6 @@ impl Tracer<'_> {
                 return;
             }
         }
-        self.look_around(tile, seen);
-        let tile = &*tile;
         for step in [4, 2, 1] {
             // The coarsest lattice is centred in the tile.
             let phase = step / 4 * 2;
@@ -309,7 +324,7 @@ impl Tracer<'_> {
                 if known[row][column].is_some() || !on_lattice(column) || !on_lattice(row) {
                     continue;
                 }
-                let face = (hit.primitive, hit.crossing.part);
+                let face = face_of(&hit);
                 let shared = match step {
                     4 => None,
                     2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
@@ -337,7 +352,7 @@ impl Tracer<'_> {
         }
         if path.weight < WEAK {
             return Lit {
-                face: (hit.primitive, hit.crossing.part),
+                face: face_of(hit),
                 sky: 0.85,
                 lamp: 0.8,
             };
@@ -360,7 +375,7 @@ impl Tracer<'_> {
             Self::lamp_share::<LAMP_SAMPLES>
         };
         Lit {
-            face: (hit.primitive, hit.crossing.part),
+            face: face_of(hit),
             sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
             lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
                 lamp(self, &point, own, path.twist, tile, scratch)

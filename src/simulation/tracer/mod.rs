@@ -10,18 +10,20 @@ mod light;
 mod shade;
 mod tiles;
 
+use std::ops::Range;
+
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 pub use self::{light::LitView, shade::refracted};
 use self::{
-    light::{Lit, UNLIT},
+    light::{Lit, UNLIT, face_of},
     shade::{Paint, plus},
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
 use super::{
-    scene::{ObjectId, Primitive, Scene},
-    shapes::{Bounds, Ray},
+    scene::{Finish, Hit, ObjectId, Primitive, Scene},
+    shapes::{Bounds, Crossing, Ray, Shape},
     texture::{Rgb, scaled},
 };
 use crate::{
@@ -96,12 +98,16 @@ pub struct Tracer<'a> {
     pub lighting: &'a Lighting,
 }
 
-/// Reused per row.
+/// Reused per tile.
 #[derive(Default)]
 struct Scratch {
     casters: Vec<u32>,
     paints: Vec<Option<Paint>>,
+    seen: Vec<Seen>,
 }
+
+/// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
+type Seen = (usize, Path, f64, Option<Hit>);
 
 /// A ray on its way.
 #[derive(Clone, Copy)]
@@ -249,19 +255,32 @@ impl Tracer<'_> {
                                 frame.nearest_m(shape).max(print.nearest_m)
                             })
                         });
-                        let mut seen = Vec::with_capacity(TILE * TILE);
+                        let mut seen = std::mem::take(&mut scratch.seen);
+                        seen.clear();
                         for row in 0..height {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
                                 let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
-                                let hit = self.first(&path.ray, &tile, u, v);
-                                seen.push((row * width + column, path, cos, hit));
+                                seen.push((row * width + column, path, cos, None));
                             }
                         }
+                        self.look(&tile, &mut seen, left..right, rows.clone());
                         self.light(&mut tile, &seen, beside, lit, width, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
                         self.paint(isa, &seen, &mut paints);
-                        for ((at, path, cos, hit), &paint) in seen.into_iter().zip(&paints) {
+                        for (&(at, path, cos, hit), &paint) in seen.iter().zip(&paints) {
+                            let matte = hit.zip(paint).filter(|(hit, _)| {
+                                let material = &self.scene.primitives()[hit.primitive].material;
+                                material.finish == Finish::Matte
+                            });
+                            if let Some((hit, paint)) = matte {
+                                let point = path.ray.at(hit.crossing.t);
+                                radiance[at] = self.diffuse(&point, &paint, lit[at]);
+                                depth[at] = (hit.crossing.t * cos) as f32;
+                                through[at] = depth[at];
+                                object[at] = self.scene.primitives()[hit.primitive].object;
+                                continue;
+                            }
                             let near = Near {
                                 lit: Some(lit[at]),
                                 view: beside,
@@ -286,6 +305,7 @@ impl Tracer<'_> {
                             };
                         }
                         scratch.paints = paints;
+                        scratch.seen = seen;
                         tiles.push(tile);
                     }
                     tiles
@@ -326,7 +346,10 @@ impl Tracer<'_> {
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         // Where there is no glass, what is seen here is seen at one of these pixels.
                         let hit = if clear {
-                            self.first_of(&path.ray, around.map(|at| at.map(|at| lit[at].face.0)))
+                            self.first_of(
+                                &path.ray,
+                                around.map(|at| at.map(|at| lit[at].face.0 as usize)),
+                            )
                         } else {
                             None
                         }
@@ -334,9 +357,10 @@ impl Tracer<'_> {
                         // What the pixel or one beside it shows of the same face: its texture and light are averaged
                         // over a pixel already, and do not differ much.
                         let known = hit.and_then(|hit| {
-                            around.into_iter().flatten().find(|&there| {
-                                lit[there].face == (hit.primitive, hit.crossing.part)
-                            })
+                            around
+                                .into_iter()
+                                .flatten()
+                                .find(|&there| lit[there].face == face_of(&hit))
                         });
                         let near = Near {
                             lit: None,
@@ -354,6 +378,44 @@ impl Tracer<'_> {
                 }
             });
         (rendering, view)
+    }
+}
+
+impl Tracer<'_> {
+    /// Finds what each ray of a tile meets.
+    fn look(&self, tile: &Tile, seen: &mut [Seen], columns: Range<usize>, rows: Range<usize>) {
+        let (across, last) = (columns.len(), seen.len() - 1);
+        let flat = self.flat(
+            tile,
+            [
+                (0, columns.start, rows.start),
+                (across - 1, columns.end - 1, rows.start),
+                (last + 1 - across, columns.start, rows.end - 1),
+                (last, columns.end - 1, rows.end - 1),
+            ]
+            .map(|(index, column, row)| (&seen[index].1.ray, column, row)),
+        );
+        let face = flat.and_then(|hit| match &self.scene.primitives()[hit.primitive].shape {
+            Shape::Solid(solid) => Some((solid, hit)),
+            _ => None,
+        });
+        match face {
+            Some((solid, hit)) => {
+                for (_, path, _, met) in seen {
+                    let crossing = Crossing {
+                        t: solid.on_plane_of(hit.crossing.part, &path.ray),
+                        ..hit.crossing
+                    };
+                    *met = Some(Hit { crossing, ..hit });
+                }
+            }
+            None => {
+                let places = rows.flat_map(|row| columns.clone().map(move |column| (column, row)));
+                for ((_, path, _, met), (column, row)) in seen.iter_mut().zip(places) {
+                    *met = self.first(&path.ray, tile, column, row);
+                }
+            }
+        }
     }
 }
 

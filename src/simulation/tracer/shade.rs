@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use nalgebra::{Point3, Vector3};
 
-use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit, tiles::TILE};
+use super::{LIFT, Near, Path, Scratch, Seen, Tracer, light::Lit, tiles::TILE};
 use crate::{
     isa::Isa,
     lanes::LANES,
@@ -65,12 +65,7 @@ pub(super) struct Paint {
 
 impl Tracer<'_> {
     /// The surface that each of a tile's rays meets. Its pattern is evaluated for many rays at once.
-    pub(super) fn paint(
-        &self,
-        isa: Isa,
-        seen: &[(usize, Path, f64, Option<Hit>)],
-        paints: &mut Vec<Option<Paint>>,
-    ) {
+    pub(super) fn paint(&self, isa: Isa, seen: &[Seen], paints: &mut Vec<Option<Paint>>) {
         paints.clear();
         let mut spots = [Spot::default(); TILE * TILE];
         // Which rays wait for their colour.
@@ -252,6 +247,29 @@ impl Tracer<'_> {
         plus(through, scaled(reflected, share))
     }
 
+    /// The light that a surface scatters.
+    #[inline]
+    pub(super) fn diffuse(&self, point: &Point3<f64>, paint: &Paint, lit: Lit) -> Rgb {
+        let normal = &paint.normal;
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        let sky = plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        );
+        let lamp = &lighting.lamp;
+        let to_lamp = lamp.center - point;
+        let distance = to_lamp.norm();
+        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
+        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
+        let light = plus(
+            scaled(sky, lit.sky),
+            scaled(lamp.irradiance, lit.lamp * falloff),
+        );
+        times(paint.colour, light)
+    }
+
     fn opaque(
         &self,
         path: &Path,
@@ -277,23 +295,15 @@ impl Tracer<'_> {
             }
         });
         let travelled = path.travelled + hit.crossing.t;
-        let lighting = self.lighting;
-        let up = (0.5 + 0.5 * normal.z) as f32;
-        let (towards, window) = &lighting.window;
-        let sky = plus(
-            mixed(lighting.ground, lighting.sky, up),
-            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        let diffuse = self.diffuse(
+            &point,
+            &Paint {
+                normal,
+                cos,
+                colour,
+            },
+            lit,
         );
-        let lamp = &lighting.lamp;
-        let to_lamp = lamp.center - point;
-        let distance = to_lamp.norm();
-        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
-        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
-        let light = plus(
-            scaled(sky, lit.sky),
-            scaled(lamp.irradiance, lit.lamp * falloff),
-        );
-        let diffuse = times(colour, light);
         let Finish::Glossy {
             reflectance,
             sharpness,

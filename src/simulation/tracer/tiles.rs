@@ -212,6 +212,37 @@ impl Tracer<'_> {
         best
     }
 
+    /// The face that is all that a tile shows, if it is a single flat one: its primitive and part. `corners`: the rays
+    /// through the tile's outermost pixels, with column and row.
+    pub(super) fn flat(&self, tile: &Tile, corners: [(&Ray, usize, usize); 4]) -> Option<Hit> {
+        let mut farthest: Option<Hit> = None;
+        for (ray, column, row) in corners {
+            let hit = self.first(ray, tile, column, row)?;
+            if let Some(before) = farthest
+                && (before.primitive, before.crossing.part) != (hit.primitive, hit.crossing.part)
+            {
+                return None;
+            }
+            farthest = match farthest {
+                Some(before) if before.crossing.t >= hit.crossing.t => farthest,
+                _ => Some(hit),
+            };
+        }
+        let hit = farthest?;
+        // A face of a convex solid that holds the corners holds all between them, none of it farther than the farthest
+        // corner.
+        let alone = tile
+            .seen
+            .iter()
+            .take_while(|print| print.nearest_m <= hit.crossing.t)
+            .all(|print| print.primitive == hit.primitive);
+        let solid = matches!(
+            self.scene.primitives()[hit.primitive].shape,
+            Shape::Solid(_)
+        );
+        (alone && solid).then_some(hit)
+    }
+
     /// The nearest hit of a ray through this pixel of the tile.
     pub(super) fn first(&self, ray: &Ray, tile: &Tile, column: usize, row: usize) -> Option<Hit> {
         let mut best: Option<Hit> = None;
