@@ -1,5 +1,5 @@
-//! Where a memory may still expect the person: the places of the world in which cameras saw one, until a camera looks from
-//! there again.
+//! Where a memory may still expect the person: the places of the world in which cameras saw one, until a camera has come
+//! back there and passed.
 //!
 //! In: frames with their true poses, true depth and what is seen in them. Out: the squares of an image in which what is
 //! gone would be seen.
@@ -19,9 +19,9 @@ use crate::{
 
 /// Of turning a camera, as viewpoints are compared.
 const METRES_PER_RADIAN: f64 = 1.0;
-/// What was seen at most this far from here belongs to viewpoints from which the expectation here is made, metres.
-const EXPECTED_WITHIN_M: f64 = 0.15;
-/// A frame from this close overwrites what was seen, metres: twice what separates viewpoints.
+/// Viewpoints this close together are selected together, metres: from there the expectation is made.
+const EXPECTED_WITHIN_M: f64 = 0.10;
+/// A robot that comes back along its arc passes this close to where it was, metres.
 const SEEN_AGAIN_WITHIN_M: f64 = 0.05;
 /// Every so many columns and rows the person's surface is noted, pixels.
 const STEP_PX: usize = 4;
@@ -32,6 +32,12 @@ const SIGHTS_MAX: usize = 512;
 
 /// Of the person, from one pose.
 struct Sight {
+    /// Whose.
+    station: usize,
+    /// That station has gone elsewhere since.
+    left: bool,
+    /// The station that is passing there again.
+    passing: Option<usize>,
     world_from_camera: Pose,
     surface_in_world: Vec<Point3<f64>>,
 }
@@ -42,7 +48,7 @@ pub struct Afterimages {
 }
 
 impl Afterimages {
-    /// The squares of an image in which the person was seen, from about here, and nobody looked since.
+    /// The squares of an image in which the person was seen, from about here, before anybody came back.
     pub fn squares(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Squares {
         let camera_from_world = world_from_camera.inverse();
         let inside = |(u, v): &(f64, f64)| {
@@ -60,10 +66,25 @@ impl Afterimages {
         )
     }
 
-    /// A camera looked: what was seen from there before is gone, and a person who is there is noted.
-    pub fn look(&mut self, camera: &Intrinsics, world_from_camera: &Pose, shot: &Shot) {
-        self.sights
-            .retain(|sight| distance_m(sight, world_from_camera) > SEEN_AGAIN_WITHIN_M);
+    /// A station's camera looked: what was seen from a place that it comes back to is gone when it has passed, and a
+    /// person who is there is noted.
+    pub fn look(
+        &mut self,
+        station: usize,
+        camera: &Intrinsics,
+        world_from_camera: &Pose,
+        shot: &Shot,
+    ) {
+        self.sights.retain_mut(|sight| {
+            let apart = distance_m(sight, world_from_camera);
+            sight.left |= sight.station == station && apart > EXPECTED_WITHIN_M;
+            let near = apart <= SEEN_AGAIN_WITHIN_M;
+            let passed = sight.passing == Some(station) && !near;
+            if sight.left && near && sight.passing.is_none() {
+                sight.passing = Some(station);
+            }
+            !passed
+        });
         let places = (0..camera.height)
             .step_by(STEP_PX)
             .flat_map(|v| (0..camera.width).step_by(STEP_PX).map(move |u| (u, v)));
@@ -81,6 +102,9 @@ impl Afterimages {
             self.sights.pop_front();
         }
         self.sights.push_back(Sight {
+            station,
+            left: false,
+            passing: None,
             world_from_camera: *world_from_camera,
             surface_in_world,
         });

@@ -19,7 +19,7 @@ const SAME_IOU: f64 = 0.2;
 /// A region this close to something that changed has a reason (its shadow, its reflection), pixels.
 const NEAR_PX: u32 = 8;
 /// What a person hid or shaded may surprise for so long after the person is gone, frames. Where the person itself was,
-/// surprise tells nothing until somebody has looked again: see [`Afterimages`].
+/// surprise tells nothing until a camera has come back: see [`Afterimages`].
 const PERSON_ECHO: u32 = 7;
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -118,7 +118,7 @@ impl Judge {
         let camera = &self.cameras[station];
         let afterimage = self.afterimages.squares(camera, &capture.world_from_camera);
         self.afterimages
-            .look(camera, &capture.world_from_camera, &capture.middle);
+            .look(station, camera, &capture.world_from_camera, &capture.middle);
 
         regions
             .iter()

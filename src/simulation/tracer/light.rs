@@ -19,13 +19,16 @@ use crate::{
 
 const LAMP_SAMPLES: usize = 9;
 const SKY_SAMPLES: usize = 5;
-/// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
+/// Where a sample is one of several of a pixel.
 const FEW_LAMP_SAMPLES: usize = 4;
 const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
+/// Points in a mirror or behind glass that are no farther apart than this cube's side share their light, metres: about a
+/// pixel on the table.
+const CELL_M: f64 = 0.004;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
 
@@ -103,13 +106,16 @@ impl LitView {
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
         let face = face_of(hit);
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
-        for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
-            for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
-                let near = across * along;
-                // Rectified cameras meet in whole rows.
-                if near < 1e-4 || column >= width || row >= height {
+        for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
+            // Rectified cameras meet in whole rows.
+            if along < 1e-4 || row >= height {
+                continue;
+            }
+            for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
+                if column >= width {
                     continue;
                 }
+                let near = across * along;
                 let at = row * width + column;
                 let lit = &self.lit[at];
                 let apart = (f64::from(self.depth_m[at]) - depth_m).abs();
@@ -284,10 +290,9 @@ impl Tracer<'_> {
         self.look_around(tile, seen);
         let tile = &*tile;
         if tile.lamp.is_empty() && tile.sky.is_empty() {
-            // Nothing is in the light's way: a point sees all of the lamp, or is turned away from it.
             for (at, path, _, hit) in seen {
                 if let Some(hit) = hit {
-                    lit[*at] = self.light_on(path, hit, Some(tile), scratch);
+                    lit[*at] = self.unshaded(path, hit);
                 }
             }
             return;
@@ -339,6 +344,45 @@ impl Tracer<'_> {
         }
     }
 
+    /// The light on a point that nothing shades: all of the lamp, unless it is turned away from it.
+    fn unshaded(&self, path: &Path, hit: &Hit) -> Lit {
+        let primitive = &self.scene.primitives()[hit.primitive];
+        if primitive.is_glass() {
+            return UNLIT;
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let outward = primitive.shape.normal(&point, hit.crossing.part);
+        let facing = path.ray.direction.dot(&outward) < 0.0;
+        let towards = outward.dot(&(self.lighting.lamp.center - point)) > 0.0;
+        Lit {
+            face: face_of(hit),
+            sky: 1.0,
+            lamp: f32::from(facing == towards),
+        }
+    }
+
+    /// [`Self::light_on`] what is seen in a mirror or through glass. Points of a face that lie close together share it.
+    pub(super) fn light_beyond(
+        &self,
+        path: &Path,
+        hit: &Hit,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> Lit {
+        if path.bounces == 0 || path.weight < WEAK {
+            return self.light_on(path, hit, tile, scratch);
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let cell = (point.coords / CELL_M).map(|x| x.floor() as i32);
+        let place = (face_of(hit), [cell.x, cell.y, cell.z]);
+        if let Some(lit) = scratch.beyond.get(&place) {
+            return *lit;
+        }
+        let lit = self.light_on(path, hit, tile, scratch);
+        scratch.beyond.insert(place, lit);
+        lit
+    }
+
     pub(super) fn light_on(
         &self,
         path: &Path,
@@ -362,14 +406,12 @@ impl Tracer<'_> {
         let facing = path.ray.direction.dot(&outward) < 0.0;
         let normal = if facing { outward } else { -outward };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
-        // Seen in a mirror or through glass, fewer samples do.
-        let few = path.few || path.bounces > 0;
-        let sky = if few {
+        let sky = if path.few {
             Self::sky_share::<FEW_SKY_SAMPLES>
         } else {
             Self::sky_share::<SKY_SAMPLES>
         };
-        let lamp = if few {
+        let lamp = if path.few {
             Self::lamp_share::<FEW_LAMP_SAMPLES>
         } else {
             Self::lamp_share::<LAMP_SAMPLES>

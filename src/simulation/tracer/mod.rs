@@ -10,14 +10,15 @@ mod light;
 mod shade;
 mod tiles;
 
-use std::ops::Range;
+use std::{collections::HashMap, ops::Range};
 
+use arrayvec::ArrayVec;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 pub use self::{light::LitView, shade::refracted};
 use self::{
-    light::{Lit, UNLIT, face_of},
+    light::{Face, Lit, UNLIT, face_of},
     shade::{Paint, plus},
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
@@ -104,6 +105,9 @@ struct Scratch {
     casters: Vec<u32>,
     paints: Vec<Option<Paint>>,
     seen: Vec<Seen>,
+    /// Light on what is seen in mirrors and through glass, by face and place; of one row, or band, of pixels, so that it
+    /// does not depend on which of them a thread takes.
+    beyond: HashMap<(Face, [i32; 3]), Lit>,
 }
 
 /// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
@@ -232,6 +236,7 @@ impl Tracer<'_> {
             .map_init(
                 Scratch::default,
                 |scratch, (band, ((((radiance, depth), through), object), lit))| {
+                    scratch.beyond.clear();
                     let top = band * TILE;
                     let height = radiance.len() / width;
                     let rows = top..top + height;
@@ -320,6 +325,7 @@ impl Tracer<'_> {
             .par_chunks_mut(width)
             .enumerate()
             .for_each_init(Scratch::default, |scratch, (row, radiance)| {
+                scratch.beyond.clear();
                 for (column, radiance) in radiance.iter_mut().enumerate() {
                     if !rough(camera, &rendering.object, lit, &first, column, row) {
                         continue;
@@ -337,6 +343,13 @@ impl Tracer<'_> {
                         .into_iter()
                         .flatten()
                         .all(|there| lit[there].face != UNLIT.face);
+                    let mut nearby = ArrayVec::<usize, 5>::new();
+                    for at in around.into_iter().flatten() {
+                        let primitive = lit[at].face.0 as usize;
+                        if !nearby.contains(&primitive) {
+                            nearby.push(primitive);
+                        }
+                    }
                     // Glass is looked through again for every sample.
                     let offsets = if clear { &SAMPLES[..] } else { &SAMPLES[..2] };
                     let share = 1.0 / (offsets.len() + 1) as f32;
@@ -346,10 +359,7 @@ impl Tracer<'_> {
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         // Where there is no glass, what is seen here is seen at one of these pixels.
                         let hit = if clear {
-                            self.first_of(
-                                &path.ray,
-                                around.map(|at| at.map(|at| lit[at].face.0 as usize)),
-                            )
+                            self.first_of(&path.ray, &nearby)
                         } else {
                             None
                         }
@@ -431,14 +441,14 @@ fn rough(
     let width = camera.width;
     let here = row * width + column;
     let differs = |there: usize| {
-        let (a, b) = (radiance[here], radiance[there]);
-        if object[here] != object[there] {
-            return true;
-        }
         // Textures are averaged over the pixel already; what is seen through glass is not.
         if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
             return false;
         }
+        if object[here] != object[there] {
+            return true;
+        }
+        let (a, b) = (radiance[here], radiance[there]);
         (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
     };
     (column > 0 && differs(here - 1))

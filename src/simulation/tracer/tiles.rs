@@ -186,20 +186,10 @@ impl Tracer<'_> {
     }
 
     /// The nearest hit of a ray with one of these primitives.
-    pub(super) fn first_of<const N: usize>(
-        &self,
-        ray: &Ray,
-        primitives: [Option<usize>; N],
-    ) -> Option<Hit> {
+    pub(super) fn first_of(&self, ray: &Ray, primitives: &[usize]) -> Option<Hit> {
         let mut best: Option<Hit> = None;
         let mut t_max = f64::INFINITY;
-        for (index, primitive) in primitives.iter().enumerate() {
-            let Some(primitive) = *primitive else {
-                continue;
-            };
-            if primitives[..index].contains(&Some(primitive)) {
-                continue;
-            }
+        for &primitive in primitives {
             let shape = &self.scene.primitives()[primitive].shape;
             if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
                 t_max = crossing.t;
@@ -212,8 +202,8 @@ impl Tracer<'_> {
         best
     }
 
-    /// The face that is all that a tile shows, if it is a single flat one: its primitive and part. `corners`: the rays
-    /// through the tile's outermost pixels, with column and row.
+    /// If all that a tile shows is one flat face: where one of its corner pixels meets it. `corners`: their rays, columns
+    /// and rows.
     pub(super) fn flat(&self, tile: &Tile, corners: [(&Ray, usize, usize); 4]) -> Option<Hit> {
         let mut farthest: Option<Hit> = None;
         for (ray, column, row) in corners {
@@ -229,18 +219,21 @@ impl Tracer<'_> {
             };
         }
         let hit = farthest?;
+        let Shape::Solid(solid) = &self.scene.primitives()[hit.primitive].shape else {
+            return None;
+        };
+        let (normal, offset) = &solid.planes()[hit.crossing.part];
+        let before_face = |primitive: usize| {
+            let bounds = &self.scene.bounds()[primitive];
+            normal.dot(&bounds.center().coords) + normal.abs().dot(&bounds.half()) > offset + 1e-9
+        };
         // A face of a convex solid that holds the corners holds all between them, none of it farther than the farthest
         // corner.
-        let alone = tile
-            .seen
+        tile.seen
             .iter()
             .take_while(|print| print.nearest_m <= hit.crossing.t)
-            .all(|print| print.primitive == hit.primitive);
-        let solid = matches!(
-            self.scene.primitives()[hit.primitive].shape,
-            Shape::Solid(_)
-        );
-        (alone && solid).then_some(hit)
+            .all(|print| print.primitive == hit.primitive || !before_face(print.primitive))
+            .then_some(hit)
     }
 
     /// The nearest hit of a ray through this pixel of the tile.
