@@ -327,7 +327,8 @@ impl Tracer<'_> {
             .for_each_init(Scratch::default, |scratch, (row, radiance)| {
                 scratch.beyond.clear();
                 for (column, radiance) in radiance.iter_mut().enumerate() {
-                    if !rough(camera, &rendering.object, lit, &first, column, row) {
+                    let more = more_samples(camera, &rendering.object, lit, &first, column, row);
+                    if more == 0 {
                         continue;
                     }
                     let here = row * width + column;
@@ -351,7 +352,7 @@ impl Tracer<'_> {
                         }
                     }
                     // Glass is looked through again for every sample.
-                    let offsets = if clear { &SAMPLES[..] } else { &SAMPLES[..2] };
+                    let offsets = &SAMPLES[..if clear { more } else { 2 }];
                     let share = 1.0 / (offsets.len() + 1) as f32;
                     let mut sum = scaled(*radiance, share);
                     for (index, &(du, dv)) in offsets.iter().enumerate() {
@@ -429,32 +430,42 @@ impl Tracer<'_> {
     }
 }
 
-/// Does a pixel differ from one of its neighbours in surface, or strongly in colour?
-fn rough(
+/// How many more samples a pixel needs: none where it is like its neighbours, all of [`SAMPLES`] where one of them has
+/// another colour, two where one shows another object of about the same colour.
+fn more_samples(
     camera: &Intrinsics,
     object: &[ObjectId],
     lit: &[Lit],
     radiance: &[Rgb],
     column: usize,
     row: usize,
-) -> bool {
+) -> usize {
     let width = camera.width;
     let here = row * width + column;
-    let differs = |there: usize| {
+    let needed = |there: usize| {
         // Textures are averaged over the pixel already; what is seen through glass is not.
         if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
-            return false;
-        }
-        if object[here] != object[there] {
-            return true;
+            return 0;
         }
         let (a, b) = (radiance[here], radiance[there]);
-        (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
+        let contrast = (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05));
+        match (contrast, object[here] != object[there]) {
+            (true, _) => SAMPLES.len(),
+            (false, true) => 2,
+            (false, false) => 0,
+        }
     };
-    (column > 0 && differs(here - 1))
-        || (column + 1 < width && differs(here + 1))
-        || (row > 0 && differs(here - width))
-        || (row + 1 < camera.height && differs(here + width))
+    [
+        (column > 0).then(|| here - 1),
+        (column + 1 < width).then_some(here + 1),
+        (row > 0).then(|| here - width),
+        (row + 1 < camera.height).then_some(here + width),
+    ]
+    .into_iter()
+    .flatten()
+    .map(needed)
+    .max()
+    .unwrap_or(0)
 }
 
 /// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the

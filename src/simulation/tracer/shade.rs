@@ -240,10 +240,12 @@ impl Tracer<'_> {
         if path.bounces > 1 || !entering {
             return plus(through, scaled(self.surroundings(&reflection), share));
         }
-        let reflected = plus(
-            self.trace(&onward(reflection, share), near, scratch),
-            self.highlights(&point, &reflection, 0.08),
-        );
+        let seen = if path.weight * share > FAINT {
+            self.trace(&onward(reflection, share), near, scratch)
+        } else {
+            self.surroundings(&reflection)
+        };
+        let reflected = plus(seen, self.highlights(&point, &reflection, 0.08));
         plus(through, scaled(reflected, share))
     }
 
