@@ -22,7 +22,8 @@ import time
 import urllib.parse
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "examples" / "python"), str(ROOT / "tests" / "python")]
 
 import scene  # noqa: E402
 from daemon import Daemon, Robot, open_session  # noqa: E402

@@ -11,10 +11,15 @@ use reference::{
 };
 use surprised::{
     config::Settings,
-    memory::forget::{Forget, Forgetting, Forgotten, Region},
+    memory::{
+        Version,
+        forget::{Forget, Forgetting, Forgotten, Region},
+        store::form::{self, Label},
+    },
     model::{
         belief::{Belief, Record},
         camera::Intrinsics,
+        frame::DepthSource,
         pose::Pose,
         viewpoint::{Mesh, Viewpoint},
     },
@@ -56,8 +61,13 @@ fn learn(pipeline: &mut Pipeline, step: u64, position: u64) {
 }
 
 fn learnt() -> Pipeline {
+    learnt_with(false)
+}
+
+/// Only where poses are refined there is something that they are refined against.
+fn learnt_with(refine_pose: bool) -> Pipeline {
     let settings = Settings {
-        refine_pose: false,
+        refine_pose,
         ..Settings::robust()
     };
     let mut pipeline = Pipeline::new(settings, pool(2));
@@ -146,11 +156,12 @@ fn a_forgotten_sphere_is_unseen_and_everything_else_stays_bit_for_bit() {
 
 #[test]
 fn nothing_of_the_forgotten_is_left_in_what_poses_are_refined_against() {
-    let mut pipeline = learnt();
+    let mut pipeline = learnt_with(true);
     let before: Vec<Arc<Viewpoint>> = pipeline.memory().viewpoints().to_vec();
     forget(&mut pipeline, in_region(HOLE));
     for (old, new) in before.iter().zip(pipeline.memory().viewpoints()) {
         let width = old.coarse.mesh.intrinsics.width;
+        assert_eq!(old.coarse.luminance.len(), 32 * 24);
         for pixel in 0..old.coarse.luminance.len() {
             let upper = 2 * (pixel / width) * 64 + 2 * (pixel % width);
             let gone = [upper, upper + 1, upper + 64, upper + 65]
@@ -168,6 +179,42 @@ fn nothing_of_the_forgotten_is_left_in_what_poses_are_refined_against() {
                 assert_eq!(new.coarse.variance[pixel], old.coarse.variance[pixel]);
             }
         }
+    }
+}
+
+#[test]
+fn what_was_forgotten_is_stored_and_read_back_bit_for_bit_and_its_size_is_known() {
+    let mut pipeline = learnt_with(true);
+    // Twice, and once over what had no depth: a viewpoint's coarse picture follows from what is stored of it.
+    let mut frame = wall().frame(&intrinsics(), &along(2), 60);
+    if let DepthSource::Given(depth_m) = &mut frame.depth {
+        for (pixel, z_m) in depth_m.iter_mut().enumerate() {
+            if pixel % 7 == 0 || (20..24).contains(&(pixel / 64)) {
+                *z_m = 0.0;
+            }
+        }
+    }
+    frame.stamp_ns = second(60);
+    pipeline.process(&frame).expect("the frame is good");
+    for center in [Point3::new(0.1, 0.05, 2.0), Point3::new(0.3, -0.1, 2.0)] {
+        let radius_m = 0.15;
+        forget(
+            &mut pipeline,
+            in_region(Region::Sphere { center, radius_m }),
+        );
+        let label = Label {
+            place: "lab".to_owned(),
+            version: Version::default(),
+            settings_hash: 0,
+        };
+        let viewpoints = pipeline.memory().viewpoints();
+        for viewpoint in viewpoints {
+            let object = form::encode(&label, viewpoint);
+            let (_, read) = form::decode(&object, usize::MAX).expect("it was just made");
+            assert!(read == **viewpoint, "viewpoint {}", viewpoint.id);
+        }
+        let bytes: usize = viewpoints.iter().map(|viewpoint| viewpoint.bytes()).sum();
+        assert_eq!(pipeline.memory().bytes(), bytes);
     }
 }
 

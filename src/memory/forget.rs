@@ -102,6 +102,18 @@ impl Forgetting {
     }
 }
 
+/// A viewpoint that was gone through.
+struct Cleared {
+    index: usize,
+    id: u64,
+    written: Written,
+    pixels: u64,
+    /// Something of it.
+    left: bool,
+    bytes_before: usize,
+    bytes: usize,
+}
+
 fn written(viewpoint: &Viewpoint) -> Written {
     (viewpoint.updates, viewpoint.stamp_ns)
 }
@@ -124,17 +136,34 @@ impl Memory {
             .take(viewpoints_max)
             .collect();
         let is_last = pending.len() < viewpoints_max;
-        // Index, id, version, pixels forgotten, whether anything is left.
-        let cleared: Vec<(usize, u64, Written, u64, bool)> = pending
+        let cleared: Vec<Cleared> = pending
             .par_iter_mut()
             .map(|(index, viewpoint)| {
+                let bytes_before = viewpoint.bytes();
                 let pixels = clear(viewpoint, region);
-                let left = region.is_some() && !(pixels > 0 && viewpoint.is_empty());
-                (*index, viewpoint.id, written(viewpoint), pixels, left)
+                Cleared {
+                    index: *index,
+                    id: viewpoint.id,
+                    written: written(viewpoint),
+                    pixels,
+                    left: region.is_some() && !(pixels > 0 && viewpoint.is_empty()),
+                    bytes_before,
+                    bytes: viewpoint.bytes(),
+                }
             })
             .collect();
         let mut gone = Vec::new();
-        for (index, id, written, pixels, left) in cleared {
+        for one in cleared {
+            let Cleared {
+                index,
+                id,
+                written,
+                pixels,
+                left,
+                ..
+            } = one;
+            // Around what was forgotten its surface has other parts.
+            self.bytes = self.bytes - one.bytes_before + one.bytes;
             forgetting.forgotten.pixels += pixels;
             if !left {
                 forgetting.forgotten.removed.push(id);

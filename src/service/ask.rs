@@ -1,6 +1,6 @@
 //! What others may ask a place's worker, between its frames. A step of any ask takes one pass of the engine at most.
 
-use std::sync::Arc;
+use std::{sync::Arc, time::Instant};
 
 use tokio::sync::oneshot;
 
@@ -31,12 +31,15 @@ pub enum Ask {
         world_from_camera: Pose,
         intrinsics: Intrinsics,
         planes: Vec<PriorPlane>,
+        /// Since when it waits for stored viewpoints.
+        brought_since: Option<Instant>,
         answer: Answer<PriorPlanes>,
     },
     Evaluate {
         frame: Box<proto::Frame>,
         /// Whose calibration and visit to use; `None`: nobody's.
         camera: Option<Source>,
+        brought_since: Option<Instant>,
         answer: Answer<Evaluated>,
     },
     Views {
@@ -60,6 +63,7 @@ pub enum Ask {
         candidates: Vec<Pose>,
         intrinsics: Intrinsics,
         promises: Vec<Promise>,
+        brought_since: Option<Instant>,
         answer: Answer<proto::NextViewReply>,
     },
     /// Goes on to its end even if nobody waits for it.
@@ -87,6 +91,27 @@ impl Ask {
             Self::Forget { .. } => false,
             Self::Mode { set, answer, .. } => set.is_none() && answer.is_closed(),
         }
+    }
+}
+
+impl Ask {
+    /// Refuses what cannot be answered before the stored memory has been read; else the ask itself.
+    pub fn refused_unread(self, refusal: Refusal) -> Option<Self> {
+        match self {
+            Self::Prior { answer, .. } => drop(answer.send(Err(refusal))),
+            Self::Evaluate { answer, .. } => drop(answer.send(Err(refusal))),
+            Self::Views { answer, .. } => drop(answer.send(Err(refusal))),
+            Self::NextView { answer, .. } | Self::Ranking { answer, .. } => {
+                drop(answer.send(Err(refusal)));
+            }
+            Self::Forget { answer, .. } => drop(answer.send(Err(refusal))),
+            Self::Mode {
+                set: None, answer, ..
+            } => drop(answer.send(Err(refusal))),
+            // What is said about a mode is kept until it can be stored; pictures are of frames that came before.
+            Self::Mode { set: Some(_), .. } | Self::Snapshot { .. } => return Some(self),
+        }
+        None
     }
 }
 

@@ -111,6 +111,8 @@ struct State {
     live_changed: bool,
     /// The stored memory has news.
     memory_news: bool,
+    /// When a message last came.
+    heard: Option<Instant>,
     closed: bool,
 }
 
@@ -168,6 +170,7 @@ impl Inbox {
             counters: SlotCounters::default(),
         });
         slot.heard = Instant::now();
+        state.heard = Some(slot.heard);
         put(slot, &mut state.counters);
         self.wake.notify_one();
         Ok(())
@@ -332,6 +335,14 @@ impl Inbox {
         cameras
             .map(|(source, slot)| (source.clone(), (slot.live, slot.counters)))
             .collect()
+    }
+
+    /// When a message last came, if ever; `None` while something waits or a camera says that it is there.
+    pub fn heard(&self) -> Option<Option<Instant>> {
+        let state = self.lock();
+        let waits = |slot: &Slot| slot.live || slot.frame.is_some();
+        let busy = !state.asks.is_empty() || state.ask_under_way;
+        (!busy && !state.cameras.values().any(waits)).then_some(state.heard)
     }
 
     pub fn counters(&self) -> InboxCounters {

@@ -415,7 +415,13 @@ impl State {
                 self.places.insert(name.clone(), after);
             }
         }
-        // Cameras that made room for others.
+        // Places and cameras that made room for others.
+        let before = self.places.len();
+        let is_here = |name: &String| statuses.iter().any(|status| status.totals.place == *name);
+        self.places.retain(|name, _| is_here(name));
+        if self.places.len() < before {
+            self.send(Arc::new(Message::Reset));
+        }
         let known = |key: &(String, Source)| {
             statuses.iter().any(|status| {
                 status.totals.place == key.0

@@ -22,7 +22,11 @@ use prometheus_client::{
 };
 
 use super::{inbox::Depths, ingest::IngestCounters, places::Places, status::PlaceTotals};
-use crate::pipeline::Stage;
+use crate::{
+    memory::store::{ROLES, StoreStatus},
+    pipeline::Stage,
+    wire::encode::{EVENT_KINDS, EVENT_STATES},
+};
 
 /// Half a millisecond to a second: from a stage of a small image to depth from three cameras.
 fn seconds() -> Histogram {
@@ -57,6 +61,10 @@ struct OfEvent {
 struct OfStatus {
     status: &'static str,
 }
+
+const STAGES: [&str; 7] = [
+    "decode", "depth", "refine", "compare", "attend", "remember", "publish",
+];
 
 type Histograms<L> = Family<L, Histogram, fn() -> Histogram>;
 
@@ -109,6 +117,25 @@ impl Metrics {
         self.events.get_or_create(&labels).inc();
     }
 
+    /// A place that is not here any more.
+    pub fn forget(&self, place: &str) {
+        let place = place.to_owned();
+        for stage in STAGES {
+            let place = place.clone();
+            self.stages.remove(&OfStage { place, stage });
+        }
+        for kind in EVENT_KINDS {
+            for state in EVENT_STATES {
+                self.events.remove(&OfEvent {
+                    place: place.clone(),
+                    kind: kind.to_owned(),
+                    state: state.to_owned(),
+                });
+            }
+        }
+        self.frames.remove(&OfPlace { place });
+    }
+
     /// An answer over HTTP, by its status.
     pub fn response(&self, status: u16) {
         let status = match status {
@@ -121,20 +148,20 @@ impl Metrics {
     }
 
     pub fn stopwatches(&self, place: &str) -> Stopwatches {
-        let stage = |stage| {
+        let [decode, depth, refine, compare, attend, remember, publish] = STAGES.map(|stage| {
             self.stages.get_or_create_owned(&OfStage {
                 place: place.to_owned(),
                 stage,
             })
-        };
+        });
         Stopwatches {
-            decode: stage("decode"),
-            depth: stage("depth"),
-            refine: stage("refine"),
-            compare: stage("compare"),
-            attend: stage("attend"),
-            remember: stage("remember"),
-            publish: stage("publish"),
+            decode,
+            depth,
+            refine,
+            compare,
+            attend,
+            remember,
+            publish,
             frame: self.frames.get_or_create_owned(&OfPlace {
                 place: place.to_owned(),
             }),
@@ -373,6 +400,17 @@ impl Collector for OfPlaces {
             "Viewpoints forgotten because the memory was full",
             |place| place.totals.replaced_for_room,
         )?;
+        out.gauges(
+            "viewpoints_known",
+            "Viewpoints in RAM or only stored",
+            |place| place.totals.viewpoints_known as i64,
+        )?;
+        out.counters(
+            "viewpoints_evicted",
+            "Stored viewpoints that left RAM because others were needed there",
+            |place| place.totals.evicted,
+        )?;
+        out.stores()?;
         out.counters(
             "ask_passes",
             "Passes of the engine that questions have taken",
@@ -383,6 +421,14 @@ impl Collector for OfPlaces {
         })?;
         out.queues()?;
         out.engines()?;
+        out.metric(
+            "places_closed",
+            "Places that made room for others",
+            MetricType::Counter,
+            |encoder, _| {
+                ConstCounter::new(places.closed()).encode(encoder.encode_family(&[("", ""); 0])?)
+            },
+        )?;
         out.service(&self.counters)
     }
 }
@@ -440,6 +486,153 @@ impl Out<'_, '_> {
             }
             Ok(())
         })
+    }
+
+    /// Of the places whose memory lasts.
+    fn stores(&mut self) -> fmt::Result {
+        let stores = || {
+            self.seen.iter().filter_map(|place| {
+                let store = place.totals.store.as_ref()?;
+                Some((place.totals.place.as_str(), store))
+            })
+        };
+        let help = "Who may write the stored place: 1 for what this service is to it";
+        let mut encoder =
+            self.encoder
+                .encode_descriptor("store_role", help, None, MetricType::Gauge)?;
+        for (place, store) in stores() {
+            for role in ROLES {
+                let labels = [("place", place), ("role", role)];
+                let is = i64::from(store.role == role);
+                ConstGauge::new(is).encode(encoder.encode_family(&labels)?)?;
+            }
+        }
+        type Of<N> = fn(&StoreStatus) -> N;
+        let counts: [(&str, &str, Of<u64>); 12] = [
+            (
+                "memory_hits",
+                "Frames and questions that found all they needed in RAM; with memory_misses this is the hit rate",
+                |store| store.hits,
+            ),
+            (
+                "memory_misses",
+                "Frames and questions that had to wait for the store",
+                |store| store.misses,
+            ),
+            (
+                "memory_misses_incomplete",
+                "Of these, those that went on without because the store did not answer in time",
+                |store| store.incomplete,
+            ),
+            ("store_loaded", "Viewpoints read from the store", |store| {
+                store.loaded
+            }),
+            (
+                "store_read_failures",
+                "Reads that the store did not answer",
+                |store| store.read_failures,
+            ),
+            (
+                "store_not_prefetched",
+                "Viewpoints expected to be needed that were too many to read",
+                |store| store.not_prefetched,
+            ),
+            (
+                "store_written",
+                "Viewpoints written to the store",
+                |store| store.written,
+            ),
+            ("store_written_bytes", "Bytes of these", |store| {
+                store.written_bytes
+            }),
+            (
+                "store_late",
+                "Of these, those written later than write_behind_s after the change",
+                |store| store.late,
+            ),
+            (
+                "store_write_failures",
+                "Batches of writes that failed at first",
+                |store| store.write_failures,
+            ),
+            (
+                "store_removed",
+                "Viewpoints deleted from the store because they were forgotten",
+                |store| store.removed,
+            ),
+            (
+                "store_lost",
+                "Changes lost because another service took the place",
+                |store| store.lost,
+            ),
+        ];
+        for (name, help, of) in counts {
+            let mut encoder =
+                self.encoder
+                    .encode_descriptor(name, help, None, MetricType::Counter)?;
+            for (place, store) in stores() {
+                let labels = [("place", place)];
+                ConstCounter::new(of(store)).encode(encoder.encode_family(&labels)?)?;
+            }
+        }
+        let mut encoder = self.encoder.encode_descriptor(
+            "memory_miss",
+            "What these waited in all",
+            Some(&Unit::Seconds),
+            MetricType::Counter,
+        )?;
+        for (place, store) in stores() {
+            let labels = [("place", place)];
+            ConstCounter::new(store.miss_seconds).encode(encoder.encode_family(&labels)?)?;
+        }
+        let gauges: [(&str, &str, Of<f64>); 8] = [
+            (
+                "store_recovered",
+                "Viewpoints found when the place was read or taken over",
+                |store| store.recovered as f64,
+            ),
+            (
+                "store_damaged",
+                "Objects that could not be read and are kept aside",
+                |store| store.damaged as f64,
+            ),
+            (
+                "store_trouble",
+                "1 while the store cannot be used",
+                |store| f64::from(u8::from(store.trouble.is_some())),
+            ),
+            ("store_viewpoints", "Viewpoints stored", |store| {
+                store.stored_viewpoints as f64
+            }),
+            ("store_bytes", "Bytes of these", |store| {
+                store.stored_bytes as f64
+            }),
+            (
+                "store_pending",
+                "Changes that are not stored yet",
+                |store| store.pending as f64,
+            ),
+            (
+                "store_pending_age_seconds",
+                "Age of the oldest of these",
+                |store| store.pending_s,
+            ),
+            (
+                "store_left_unread",
+                "Whole objects left as they are: of a later version, or too large for these settings",
+                |store| store.left_unread as f64,
+            ),
+        ];
+        for (name, help, of) in gauges {
+            let mut encoder =
+                self.encoder
+                    .encode_descriptor(name, help, None, MetricType::Gauge)?;
+            for (place, store) in stores() {
+                let labels = [("place", place)];
+                ConstGauge::new(of(store)).encode(encoder.encode_family(&labels)?)?;
+            }
+        }
+        Ok(())
     }
 
     fn queues(&mut self) -> fmt::Result {

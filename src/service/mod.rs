@@ -49,7 +49,7 @@ use self::{
     http::{Parts, Server},
     ingest::Ingest,
     live::NEWS_MAX,
-    places::Places,
+    places::{PLACES_MAX, Places},
     questions::Questions,
     readiness::Readiness,
     session::ZenohOptions,
@@ -133,10 +133,17 @@ async fn open_stored(places: Arc<Places>) {
             }
         }
     };
-    for name in names.into_iter().filter(|name| keys::is_id(name)) {
+    let names: Vec<String> = names.into_iter().filter(|name| keys::is_id(name)).collect();
+    for name in names.iter().take(PLACES_MAX) {
         if let Err(refusal) = places.get_or_open(&name.as_str().into()) {
             tracing::warn!("place {name} is stored but not opened: {refusal}");
         }
+    }
+    if names.len() > PLACES_MAX {
+        tracing::info!(
+            "{} places are stored, {PLACES_MAX} are open: the others will be when somebody sends or asks, in the room of what is quiet",
+            names.len()
+        );
     }
 }
 

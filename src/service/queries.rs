@@ -140,9 +140,10 @@ async fn answer_one(questions: &Questions, query: &Query) -> Result<Held<Payload
         // A place may be told before anything has come.
         return mode_of_place(questions, name, query).await;
     }
-    let place = questions.places.get(name);
-    let place = place.filter(|_| QUESTIONS.contains(&question));
-    let place = place.ok_or_else(unknown)?;
+    if !QUESTIONS.contains(&question) {
+        return Err(unknown());
+    }
+    let place = questions.places.known(name).await?;
     reply_to(question, name, &place, query, questions).await
 }
 

@@ -65,17 +65,6 @@ impl Questions {
         }
     }
 
-    /// # Errors
-    /// `unknown_place`.
-    pub fn place(&self, name: &str) -> Result<Arc<Place>, Refusal> {
-        self.places.get(name).ok_or_else(|| {
-            Refusal::new(
-                "unknown_place",
-                "this place is unknown: it begins with its first frame",
-            )
-        })
-    }
-
     /// Room for a request or a reply of so many bytes.
     ///
     /// # Errors
@@ -126,20 +115,7 @@ impl Questions {
     ) -> Result<T, Refusal> {
         let (sender, answer) = oneshot::channel();
         place.inbox.put_ask(make(sender)).map_err(|_full| busy())?;
-        match timeout(ANSWER_WITHIN, answer).await {
-            Ok(Ok(answer)) => answer,
-            Ok(Err(_)) => Err(Refusal::new("closing", "the service is stopping")),
-            Err(_) => {
-                self.counters.questions_late.fetch_add(1, Ordering::Relaxed);
-                Err(Refusal::new(
-                    "late",
-                    format!(
-                        "the place did not come to an answer within {} s: ask for less, or when fewer ask",
-                        ANSWER_WITHIN.as_secs()
-                    ),
-                ))
-            }
-        }
+        answered_within(ANSWER_WITHIN, answer, &self.counters).await
     }
 
     /// # Errors
@@ -173,6 +149,7 @@ impl Questions {
                 world_from_camera,
                 intrinsics,
                 planes,
+                brought_since: None,
                 answer,
             })
             .await?;
@@ -203,6 +180,7 @@ impl Questions {
                 .ask(place, |answer| Ask::Evaluate {
                     frame: Box::new(frame),
                     camera,
+                    brought_since: None,
                     answer,
                 })
                 .await?;
@@ -290,7 +268,7 @@ impl Questions {
     pub async fn mode_of_place(&self, name: &str, set: Option<Mode>) -> Result<Mode, Refusal> {
         self.counted("mode", async {
             let place = match set {
-                None => self.place(name)?,
+                None => self.places.known(name).await?,
                 Some(_) => self.open(name)?,
             };
             self.ask(&place, |answer| Ask::Mode {
@@ -311,7 +289,7 @@ impl Questions {
         self.counted("mode", async {
         let place = match set {
             None => {
-                let place = self.place(&path.place)?;
+                let place = self.places.known(&path.place).await?;
                 if !place.inbox.cameras().contains_key(&path.source) {
                     return Err(Refusal::new(
                         "unknown_camera",
@@ -343,6 +321,34 @@ impl Questions {
     }
 }
 
+/// A worker's answer, if it comes in time; else nobody waits for it any more.
+///
+/// # Errors
+/// `late`, `closing`, or whatever the worker says.
+async fn answered_within<T>(
+    within: Duration,
+    answer: oneshot::Receiver<Result<T, Refusal>>,
+    counters: &IngestCounters,
+) -> Result<T, Refusal> {
+    match timeout(within, answer).await {
+        Ok(Ok(answer)) => answer,
+        Ok(Err(_)) => Err(Refusal::new(
+            "closing",
+            "the service is stopping, or the place has just made room for another: ask again",
+        )),
+        Err(_) => {
+            counters.questions_late.fetch_add(1, Ordering::Relaxed);
+            Err(Refusal::new(
+                "late",
+                format!(
+                    "the place did not come to an answer within {} s: ask for less, or when fewer ask",
+                    within.as_secs()
+                ),
+            ))
+        }
+    }
+}
+
 /// Both names, or neither.
 ///
 /// # Errors
@@ -368,4 +374,37 @@ pub async fn off_the_loop<T: Send + 'static>(
     tokio::task::spawn_blocking(work)
         .await
         .map_err(|_| Refusal::new("closing", "the service is stopping"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::service::inbox::Inbox;
+
+    #[tokio::test]
+    async fn an_answer_that_does_not_come_in_time_is_late_counted_and_not_worked_for_any_more() {
+        let counters = IngestCounters::default();
+        let inbox = Inbox::default();
+        let (sender, receiver) = oneshot::channel();
+        let ask = Ask::Views {
+            after: 0,
+            limit: 1,
+            answer: sender,
+        };
+        inbox.put_ask(ask).expect("room");
+        let late = answered_within(Duration::from_millis(1), receiver, &counters).await;
+        assert_eq!(late.expect_err("nobody answers").code, "late");
+        assert_eq!(counters.questions_late.load(Ordering::Relaxed), 1);
+        assert!(inbox.take_ask().expect("it waits").is_abandoned());
+
+        let (sender, receiver) = oneshot::channel::<Result<(), Refusal>>();
+        drop(sender);
+        let closing = answered_within(ANSWER_WITHIN, receiver, &counters).await;
+        assert_eq!(closing.expect_err("nobody is there").code, "closing");
+        let (sender, receiver) = oneshot::channel();
+        sender.send(Ok(7)).expect("somebody waits");
+        let answered = answered_within(ANSWER_WITHIN, receiver, &counters).await;
+        assert_eq!(answered.expect("in time"), 7);
+        assert_eq!(counters.questions_late.load(Ordering::Relaxed), 1);
+    }
 }

@@ -25,7 +25,7 @@ use crate::{
     model::{
         camera::Intrinsics,
         frame::{RgbImage, Source},
-        mode::Mode,
+        mode::{Mode, Modes},
         pose::{Pose, PoseNoise},
         refusal::Refusal,
         report::Report,
@@ -89,10 +89,8 @@ struct Desk {
     frames_lost_before: u64,
     refused_by: BTreeMap<&'static str, u64>,
     stopwatches: Stopwatches,
-    /// Set for the place since it began.
-    place_mode: Option<Mode>,
-    /// Set for single cameras since.
-    modes: BTreeMap<Source, Mode>,
+    /// What was said about modes; of a stored memory, what holds there.
+    modes: Modes,
     asks: AskCounters,
 }
 
@@ -120,8 +118,7 @@ impl Worker {
             frames_lost_before: 0,
             refused_by: BTreeMap::new(),
             stopwatches: self.metrics.stopwatches(&self.place),
-            place_mode: None,
-            modes: BTreeMap::new(),
+            modes: Modes::default(),
             asks: AskCounters::default(),
             worker: self,
         };
@@ -272,34 +269,31 @@ impl Desk {
 
     /// How the frames of a camera are taken.
     fn mode(&self, source: &Source) -> Mode {
-        let set = self.modes.get(source).copied().or(self.place_mode);
-        set.unwrap_or_else(|| self.worker.pipeline.settings().mode(&source.robot))
+        let said = self.modes.of(source);
+        said.unwrap_or_else(|| self.worker.pipeline.settings().mode(&source.robot))
     }
 
     /// How the cameras of the place begin.
     fn mode_of_place(&self) -> Mode {
         let settings = self.worker.pipeline.settings();
-        self.place_mode.unwrap_or(settings.mode)
+        self.modes.place.unwrap_or(settings.mode)
     }
 
     /// Of a camera, or of all of them: what was said for single ones before is forgotten then.
     fn set_mode(&mut self, source: Option<&Source>, mode: Mode) -> Result<(), Refusal> {
-        match source {
-            None => {
-                self.modes.clear();
-                self.place_mode = Some(mode);
-            }
-            Some(source) => {
-                if self.modes.len() == MODES_MAX && !self.modes.contains_key(source) {
-                    return Err(Refusal::new(
-                        "too_many_cameras",
-                        format!(
-                            "modes of {MODES_MAX} cameras are kept already: set the place's mode instead"
-                        ),
-                    ));
-                }
-                self.modes.insert(source.clone(), mode);
-            }
+        let said = Modes::said(source, mode);
+        let then = self.modes.then(&said);
+        if then.cameras.len() > MODES_MAX {
+            return Err(Refusal::new(
+                "too_many_cameras",
+                format!(
+                    "modes of {MODES_MAX} cameras are kept already: set the place's mode instead"
+                ),
+            ));
+        }
+        self.modes = then;
+        if let Some(memory) = &self.worker.memory {
+            memory.say(&said);
         }
         Ok(())
     }
@@ -358,8 +352,15 @@ impl Desk {
         packed: &PackedFrame,
         arrived: Instant,
     ) -> Result<(), Refusal> {
-        let mut stopwatch = self.stopwatches.start();
+        self.may_recall()?;
+        // Asked before the modes: whoever has become the place's writer has read what the last one was told.
+        let may_learn = self.worker.memory.as_ref().map(PlaceStore::may_learn);
+        self.sync_modes();
         let mode = self.mode(source);
+        if mode == Mode::Learn {
+            may_learn.unwrap_or(Ok(()))?;
+        }
+        let mut stopwatch = self.stopwatches.start();
         let (limits, noise) = (self.limits, self.noise_default);
         let Some(camera) = self.cameras.get_mut(source) else {
             return Ok(());
@@ -374,9 +375,6 @@ impl Desk {
             ..
         } = &mut self.worker;
         if let Some(memory) = memory {
-            if mode == Mode::Learn {
-                memory.may_learn()?;
-            }
             memory.bring(pipeline.memory_mut(), &pose);
         }
         let report = pipeline.process_staged(mode, &frame, &mut |stage| stopwatch.ended(stage))?;
@@ -438,8 +436,24 @@ impl Desk {
         });
     }
 
+    /// # Errors
+    /// `memory_unread`.
+    fn may_recall(&self) -> Result<(), Refusal> {
+        let memory = self.worker.memory.as_ref();
+        memory.map_or(Ok(()), PlaceStore::may_recall)
+    }
+
+    /// Learns what is stored of the modes.
+    fn sync_modes(&mut self) {
+        let memory = self.worker.memory.as_ref();
+        if let Some(modes) = memory.and_then(PlaceStore::take_modes) {
+            self.modes = modes;
+        }
+    }
+
     /// Learns what is new about the stored memory.
     fn sync_memory(&mut self) {
+        self.sync_modes();
         let Worker {
             memory, pipeline, ..
         } = &mut self.worker;
@@ -448,14 +462,15 @@ impl Desk {
         }
     }
 
-    /// Has in RAM what is stored around a pose.
-    fn bring(&mut self, world_from_camera: &Pose) {
+    /// Whether what is stored around a pose is in RAM, or will not be in time; else the question has to wait for its
+    /// next turn.
+    fn bring(&mut self, world_from_camera: &Pose, since: &mut Option<Instant>) -> bool {
         let Worker {
             memory, pipeline, ..
         } = &mut self.worker;
-        if let Some(memory) = memory {
-            memory.bring(pipeline.memory_mut(), world_from_camera);
-        }
+        memory
+            .as_ref()
+            .is_none_or(|memory| memory.bring_step(pipeline.memory_mut(), world_from_camera, since))
     }
 
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
@@ -485,25 +500,50 @@ impl Desk {
     /// One step of an ask; what is left of it.
     fn work_at(&mut self, ask: Ask) -> Option<Ask> {
         // Whoever asked may have gone meanwhile: sending fails then, and there is nothing to do about it.
+        let ask = match self.may_recall() {
+            Ok(()) => ask,
+            Err(refusal) => ask.refused_unread(refusal)?,
+        };
         match ask {
             Ask::Prior {
                 world_from_camera,
                 intrinsics,
                 planes,
+                mut brought_since,
                 answer,
             } => {
+                if !self.bring(&world_from_camera, &mut brought_since) {
+                    return Some(Ask::Prior {
+                        world_from_camera,
+                        intrinsics,
+                        planes,
+                        brought_since,
+                        answer,
+                    });
+                }
                 self.asks.passes += 1;
-                self.bring(&world_from_camera);
                 let prior = self.worker.pipeline.prior(&intrinsics, &world_from_camera);
                 drop(answer.send(Ok(PriorPlanes::new(&prior, &planes))));
             }
             Ask::Evaluate {
                 frame,
                 camera,
+                mut brought_since,
                 answer,
             } => {
+                // A frame whose pose has yet to be made of its markers brings what it needs itself.
+                let pose = frame.world_from_camera.as_ref();
+                let pose = pose.and_then(|pose| decode::pose(pose).ok());
+                if pose.is_some_and(|pose| !self.bring(&pose, &mut brought_since)) {
+                    return Some(Ask::Evaluate {
+                        frame,
+                        camera,
+                        brought_since,
+                        answer,
+                    });
+                }
                 self.asks.passes += 1;
-                drop(answer.send(self.evaluate(*frame, camera)));
+                drop(answer.send(self.evaluate(*frame, camera, pose.is_some())));
             }
             Ask::Views {
                 after,
@@ -535,6 +575,7 @@ impl Desk {
                 Ok((candidates, intrinsics)) => {
                     return self.work_at(Ask::Ranking {
                         promises: Vec::with_capacity(candidates.len()),
+                        brought_since: None,
                         candidates,
                         intrinsics,
                         answer,
@@ -546,11 +587,13 @@ impl Desk {
                 candidates,
                 intrinsics,
                 mut promises,
+                mut brought_since,
                 answer,
             } => {
-                if let Some(candidate) = candidates.get(promises.len()) {
+                if let Some(candidate) = candidates.get(promises.len())
+                    && self.bring(candidate, &mut brought_since)
+                {
                     self.asks.passes += 1;
-                    self.bring(candidate);
                     promises.push(self.worker.pipeline.promise(&intrinsics, candidate));
                 }
                 if promises.len() < candidates.len() {
@@ -558,6 +601,7 @@ impl Desk {
                         candidates,
                         intrinsics,
                         promises,
+                        brought_since,
                         answer,
                     });
                 }
@@ -614,7 +658,9 @@ impl Desk {
             memory.may_learn()?;
             let held = pipeline.memory_mut();
             let stored = held.absent_to_forget(forgetting, FORGET_LOADED);
-            memory.fetch(held, stored);
+            if !stored.is_empty() {
+                memory.fetch_step(held, stored);
+            }
         }
         let done = pipeline.forget(forgetting, FORGET_STEP);
         self.sync_memory();
@@ -659,6 +705,7 @@ impl Desk {
         &mut self,
         frame: proto::Frame,
         camera: Option<Source>,
+        is_brought: bool,
     ) -> Result<Evaluated, Refusal> {
         let started = Instant::now();
         let packed = decode::frame(frame)?;
@@ -682,7 +729,12 @@ impl Desk {
         )?;
         // The maps are of the evaluated frame from here on.
         self.maps_of = None;
-        self.bring(&frame.world_from_camera);
+        let Worker {
+            memory, pipeline, ..
+        } = &mut self.worker;
+        if let Some(memory) = memory.as_ref().filter(|_| !is_brought) {
+            memory.bring(pipeline.memory_mut(), &frame.world_from_camera);
+        }
         let report = self.worker.pipeline.evaluate(&frame)?;
         Ok(Evaluated {
             report,

@@ -323,20 +323,24 @@ pub fn event_pictures(pictures: &Picture) -> (Option<proto::Image>, Option<proto
     )
 }
 
+/// An event's kinds and states by name.
+pub const EVENT_KINDS: [&str; 2] = ["change", "unseen"];
+pub const EVENT_STATES: [&str; 3] = ["new", "update", "end"];
+
 /// Without its pictures.
 pub fn event(event: &Event, place: &str) -> proto::Event {
     proto::Event {
         id: event.id,
         place: place.to_owned(),
         kind: match event.kind {
-            Kind::Change => "change",
-            Kind::Unseen => "unseen",
+            Kind::Change => EVENT_KINDS[0],
+            Kind::Unseen => EVENT_KINDS[1],
         }
         .to_owned(),
         state: match event.state {
-            State::New => "new",
-            State::Update => "update",
-            State::End(_) => "end",
+            State::New => EVENT_STATES[0],
+            State::Update => EVENT_STATES[1],
+            State::End(_) => EVENT_STATES[2],
         }
         .to_owned(),
         first_seen: Some(timestamp(event.first_seen_ns)),

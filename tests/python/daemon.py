@@ -4,6 +4,7 @@ import contextlib
 import json
 import os
 import queue
+import random
 import signal
 import socket
 import subprocess
@@ -36,18 +37,21 @@ DEADLINE_S = 30.0
 
 
 def free_port() -> int:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return listener.getsockname()[1]
+    """One that the system gives to nobody who asks for any port: it is still free when somebody listens on it."""
+    while True:
+        port = random.randrange(10_000, 32_000)
+        with contextlib.suppress(OSError), socket.socket() as listener:
+            listener.bind(("127.0.0.1", port))
+            return port
 
 
-def await_condition(what: str, condition, within_s: float = DEADLINE_S):
+def await_condition(what: str, condition, within_s: float = DEADLINE_S, every_s: float = 0.02):
     """The first true value of `condition()`."""
     end = time.monotonic() + within_s
     while time.monotonic() < end:
         if value := condition():
             return value
-        time.sleep(0.02)
+        time.sleep(every_s)
     raise AssertionError(f"not within {within_s} s: {what}")
 
 

@@ -14,7 +14,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from daemon import BINARY, Daemon, Robot, await_condition, open_session, remembered
+from daemon import BINARY, Daemon, Robot, ask, await_condition, open_session, remembered
 
 KILLS = 6
 # The promise is the last two seconds; nothing is learnt here for longer before it is looked for.
@@ -129,6 +129,31 @@ def test_kills_at_random_instants_lose_no_more_than_the_last_two_seconds(service
         again.stop()
 
 
+def test_a_frozen_camera_is_still_frozen_after_a_kill(services, url):
+    first = services(url)
+    learn(first, "lab", 4)
+    with open_session(first.endpoint) as session:
+        for key, mode in (("robot1/front", "learn"), ("@memory", "freeze"), ("bert/front", "observe")):
+            ask(session, f"surprised/lab/{key}/mode?set={mode}")
+    await_stored(first, "lab")
+    learnt = memory_of(first, "lab")
+    first.stop(signal.SIGKILL)
+    second = services(url)
+    # From its first frame on.
+    with open_session(second.endpoint) as session:
+        robot = Robot(session, "lab")
+        robot.sequence, robot.stamp_ns = 100, robot.stamp_ns + 100 * 100_000_000
+        for _ in range(5):
+            assert not robot.show().learned
+    assert memory_of(second, "lab") == learnt
+    assert status(second, "lab")["mode"] == "freeze"
+    with open_session(second.endpoint) as session:
+        bert = Robot(session, "lab", "bert")
+        assert not bert.show().learned
+        reply = ask(session, "surprised/lab/bert/front/mode?format=json")
+        assert json.loads(reply.payload.to_bytes()) == {"mode": "observe"}
+
+
 def test_of_two_services_on_one_store_one_learns_and_both_answer(services, url):
     first = services(url)
     learn(first, "lab", 6)
@@ -171,6 +196,39 @@ def test_a_place_is_exported_and_imported(services, url, tmp_path):
     second = services(other)
     await_role(second, "attic", "writer")
     assert memory_of(second, "attic") == learnt
+
+    # Where nothing is said, it lies where programs keep this user's data.
+    data = tmp_path / "data"
+    home = {**os.environ, "XDG_DATA_HOME": str(data), "HOME": str(tmp_path)}
+    subprocess.run([BINARY, "import", "attic", file], check=True, env=home, capture_output=True, timeout=60)
+    assert list((data / "surprised" / "memory" / "attic" / "viewpoints").iterdir())
+
+
+def test_more_stored_places_than_fit_are_all_to_be_had(services, url, tmp_path):
+    first = services(url)
+    learn(first, "lab", 3)
+    learnt = memory_of(first, "lab")
+    assert first.stop() == 0
+    file = tmp_path / "lab.place"
+    subprocess.run([BINARY, "export", "lab", file, "--memory", url], check=True, capture_output=True, timeout=60)
+    names = [f"room{number}" for number in range(20)]
+    for name in names:
+        subprocess.run([BINARY, "import", name, file, "--memory", url], check=True, capture_output=True, timeout=60)
+    second = services(url)
+    with open_session(second.endpoint) as session:
+        for name in names:
+            # Over HTTP, over Zenoh, and by a robot.
+            await_role(second, name, "writer")
+            assert remembered(session, name) == learnt, name
+        for name in names[::7]:
+            robot = Robot(session, name)
+            robot.sequence, robot.stamp_ns = 100, robot.stamp_ns + 100 * 100_000_000
+            assert not robot.show().regions
+        unknown = second.fetch("/api/v1/places/nowhere")
+        assert unknown[0] == 404, unknown
+        code, _, body = second.fetch("/api/v1/places")
+        assert code == 200 and len(json.loads(body)["places"]) <= 16
+    assert second.stop() == 0
 
 
 def test_a_memory_that_is_no_url_is_a_wrong_configuration():

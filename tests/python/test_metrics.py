@@ -2,18 +2,19 @@
 
 import pytest
 import scene
-from daemon import ask, await_condition, prior_request, refusal
+from daemon import Daemon, Robot, ask, await_condition, open_session, prior_request, refusal
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
+
+
+def scraped(daemon):
+    status, content_type, body = daemon.fetch("/metrics")
+    assert status == 200 and content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
+    return {family.name: family for family in text_string_to_metric_families(body.decode())}
 
 
 @pytest.fixture
 def scrape(daemon):
-    def scrape():
-        status, content_type, body = daemon.fetch("/metrics")
-        assert status == 200 and content_type == "application/openmetrics-text; version=1.0.0; charset=utf-8"
-        return {family.name: family for family in text_string_to_metric_families(body.decode())}
-
-    return scrape
+    return lambda: scraped(daemon)
 
 
 def value(families, sample: str, **labels) -> float:
@@ -112,8 +113,64 @@ def test_events_and_the_engine_are_told(scrape, place, settled):
     assert families["surprised_build"].samples[0].labels["version"]
 
 
+def test_a_stored_memory_is_told_of(tmp_path):
+    def when(daemon, what, **expected):
+        def there():
+            samples = [sample for family in scraped(daemon).values() for sample in family.samples]
+            return all(
+                any(s.name == f"surprised_{name}" and s.labels == {"place": "lab"} and s.value == number for s in samples)
+                for name, number in expected.items()
+            )
+
+        await_condition(what, there)
+        return scraped(daemon)
+
+    def role(families) -> str:
+        states = {sample.labels["role"]: sample.value for sample in families["surprised_store_role"].samples}
+        assert states.keys() == {"unread", "reader", "writer"} and sum(states.values()) == 1
+        return max(states, key=states.get)
+
+    url = (tmp_path / "memory").as_uri()
+    first, second = Daemon("--memory", url), None
+    try:
+        with open_session(first.endpoint) as session:
+            robot = Robot(session, "lab")
+            for _ in range(6):
+                robot.show()
+            families = when(first, "all is stored", store_pending=0, store_viewpoints=1)
+            assert role(families) == "writer"
+            of = {
+                name: value(families, f"surprised_{name}", place="lab")
+                for name in (
+                    "memory_hits_total", "memory_misses_total", "memory_misses_incomplete_total",
+                    "memory_miss_seconds_total", "viewpoints_known", "viewpoints_evicted_total", "store_written_total",
+                    "store_written_bytes_total", "store_bytes", "store_late_total", "store_write_failures_total",
+                    "store_removed_total", "store_lost_total", "store_damaged", "store_recovered", "store_loaded_total",
+                    "store_read_failures_total", "store_not_prefetched_total", "store_trouble",
+                    "store_pending_age_seconds", "store_left_unread",
+                )
+            }  # fmt: skip
+            assert of.pop("memory_hits_total") == 6 and of.pop("viewpoints_known") == 1
+            assert 1 <= of.pop("store_written_total") <= 6
+            assert of.pop("store_written_bytes_total") >= of.pop("store_bytes") > 1000
+            # A busy machine may be late.
+            del of["store_late_total"]
+            assert not any(of.values()), of
+
+            second = Daemon("--memory", url)
+            families = when(second, "it has read the place", store_viewpoints=1, store_loaded_total=1)
+            assert role(families) == "reader"
+            assert value(families, "surprised_store_recovered", place="lab") == 1
+            ask(session, "surprised/lab/@memory/forget?everything=true")
+            when(first, "it is forgotten", store_viewpoints=0, store_removed_total=1)
+    finally:
+        for daemon in filter(None, (first, second)):
+            daemon.end()
+
+
 def test_no_label_grows_with_robots(scrape, settled):
     labels = {label for family in scrape().values() for sample in family.samples for label in sample.labels}
     assert labels <= {
         "place", "reason", "stage", "le", "kind", "outcome", "state", "status", "queue", "engine", "version", "pass",
+        "role",
     }  # fmt: skip

@@ -1,5 +1,6 @@
 """The page in a real browser against a running demo: what an operator does with it, in the order they would."""
 
+import math
 import re
 import subprocess
 import tempfile
@@ -9,9 +10,19 @@ import pytest
 from browser import DESKTOP, PHONE, browser, visit
 from daemon import BINARY, await_condition, free_port
 
+# The robots get to know the table for 350 frames; the first thing comes within 84 more. Each takes up to half a second
+# on a busy machine.
+EVENT_WITHIN_S = 300.0
+
 ACCESSIBILITY = pytest.importorskip(
     "axe_playwright_python.sync_playwright", reason="axe-playwright-python is not installed: accessibility is not tested"
 )
+
+
+# A surprise whose cause is a thing: neither nothing nor the person who brings it.
+THING = re.compile(r" at \((\S+), (\S+), (\S+)\) m, .* - (?!nothing|person|where)(.+)$")
+# On the table, from a region's middle to its event's, which is that of all who saw it and of the hand that brought it.
+NEAR_M = 0.2
 
 
 class Demo:
@@ -29,6 +40,11 @@ class Demo:
     def lines(self) -> list[str]:
         """What it has printed so far."""
         return Path(self._printed.name).read_text().splitlines()
+
+    def things(self) -> list[tuple[float, ...]]:
+        """Where it has said that the script put something."""
+        found = (THING.search(line) for line in self.lines())
+        return [tuple(float(x) for x in at.groups()[:3]) for at in found if at]
 
     def end(self):
         self.process.kill()
@@ -93,6 +109,36 @@ def test_the_place_is_drawn_from_above_with_robots_and_viewpoints(opened):
     assert 0.5 < (x * x + y * y) ** 0.5 < 3.0, "a robot drives around the table"
 
 
+def test_an_object_that_is_put_down_is_boxed_and_listed_as_an_event(opened, demo):
+    page = opened.page
+    # Boxes come with pictures, and those only while they are looked at.
+    page.locator("#cameras").scroll_into_view_if_needed()
+
+    def listed() -> str | None:
+        """The key of an event that was boxed, and stands where the script put something."""
+        things = demo["demo"].things()
+        for key, where in page.evaluate(
+            """() => [...document.querySelectorAll('.event[data-kind="change"]')]
+                .filter((event) => window.boxed.has(event.dataset.key))
+                .map((event) => [event.dataset.key, event.innerText.match(/Where\\s+(.+) m/)?.[1]])"""
+        ):
+            at = [float(x.replace("\u2212", "-")) for x in where.split(", ")] if where else None
+            if at and any(math.dist(at[:2], thing[:2]) < NEAR_M for thing in things):
+                return key
+        return None
+
+    # Reading the list lays the whole page out.
+    key = await_condition("an object is boxed and listed", listed, EVENT_WITHIN_S, every_s=0.5)
+    opened.shot("desktop-light")
+    event = page.locator(f'#events .event[data-key="{key}"]')
+    words = event.inner_text()
+    assert re.search(r"robot[01]", words) and "nats" in words, words
+    assert re.search(r"\d\d:\d\d:\d\d", words), words
+    event.scroll_into_view_if_needed()
+    for picture in event.locator("img").all():
+        await_condition("its thumbnail is there", lambda p=picture: p.evaluate("image => image.naturalWidth") > 8)
+
+
 def test_pointing_at_the_map_asks_what_the_memory_expects_there(opened):
     page = opened.page
     page.locator("#map").scroll_into_view_if_needed()
@@ -142,7 +188,7 @@ def test_a_camera_is_opened_and_frozen_with_the_keyboard(opened):
     page.keyboard.press("ArrowRight")
     mode = f"{opened.http}/api/v1/places/kitchen/robots/robot0/front/mode"
     await_condition("the camera is frozen", lambda: opened.context.request.get(mode).json()["mode"] == "freeze")
-    await_condition("the page says so", lambda: dialog.get_by_role("radio", name="Freeze").is_checked())
+    await_condition("the page says so", dialog.get_by_role("radio", name="Freeze").is_checked)
     page.keyboard.press("Escape")
     dialog.wait_for(state="hidden")
     page.locator('.card[data-camera="robot0/front"] .badge', has_text="frozen").wait_for()

@@ -3,6 +3,8 @@
 
 use std::time::Duration;
 
+use tokio::io::AsyncWriteExt;
+
 use surprised::wire::{encode, keys, proto};
 
 use crate::rig::{PATIENCE, ROOT, Rig, camera, next_report, patient, posed};
@@ -73,6 +75,24 @@ async fn questions_beyond_the_queue_are_refused_as_busy_while_frames_go_on() {
     let status = rig.status("lab").await;
     assert_eq!(status["asks_busy"], busy);
     assert_eq!(status["frames"], 6);
+
+    // Who goes before the answer is not worked for, and that is counted.
+    let request = r#"{"world_from_camera": {"orientation": {"w": 1}}, "intrinsics": {"width": 320, "height": 240,
+        "fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}}"#;
+    patient(async {
+        while rig.status("lab").await["asks_abandoned"] == 0 {
+            let mut stream = tokio::net::TcpStream::connect(rig.http)
+                .await
+                .expect("it listens");
+            let head = format!(
+                "POST /api/v1/places/lab/prior HTTP/1.1\r\nHost: {}\r\nContent-Type: application/json\r\nContent-Length: {}\r\n\r\n{request}",
+                rig.http,
+                request.len()
+            );
+            stream.write_all(head.as_bytes()).await.expect("it reads");
+        }
+    })
+    .await;
 
     // As soon as there is room again.
     let views = keys::memory(ROOT, "lab", "views");

@@ -1,9 +1,10 @@
-//! An object store that can be cut off, and that answers slowly.
+//! An object store that can be cut off, that answers slowly, and that is interrupted while it writes.
 
 use std::{
+    collections::VecDeque,
     fmt,
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, AtomicU64, Ordering},
     },
     time::Duration,
@@ -20,7 +21,16 @@ use object_store::{
 pub struct Flaky {
     inner: Arc<dyn ObjectStore>,
     cut: AtomicBool,
+    held: AtomicBool,
     get_ms: AtomicU64,
+    interrupted: Mutex<VecDeque<Interrupted>>,
+}
+
+/// What is left of an object whose put has no answer.
+#[derive(Debug, Clone, Copy)]
+pub enum Interrupted {
+    Whole,
+    Half,
 }
 
 impl Flaky {
@@ -28,12 +38,29 @@ impl Flaky {
         Arc::new(Self {
             inner,
             cut: AtomicBool::new(false),
+            held: AtomicBool::new(false),
             get_ms: AtomicU64::new(0),
+            interrupted: Mutex::default(),
         })
     }
 
     pub fn cut_off(&self, cut: bool) {
         self.cut.store(cut, Ordering::Relaxed);
+    }
+
+    /// The next writes of viewpoints and modes, one after the other.
+    pub fn interrupt(&self, puts: impl IntoIterator<Item = Interrupted>) {
+        self.interrupted.lock().expect("no panic").extend(puts);
+    }
+
+    /// How many of them have not come yet.
+    pub fn to_interrupt(&self) -> usize {
+        self.interrupted.lock().expect("no panic").len()
+    }
+
+    /// Reads have no answer until they are let go.
+    pub fn hold_reads(&self, held: bool) {
+        self.held.store(held, Ordering::Relaxed);
     }
 
     pub fn slow_reads(&self, delay: Duration) {
@@ -67,7 +94,25 @@ impl ObjectStore for Flaky {
         options: PutOptions,
     ) -> Result<PutResult> {
         self.check()?;
-        self.inner.put_opts(path, payload, options).await
+        let next = if path.as_ref().contains("/lease/") {
+            None
+        } else {
+            self.interrupted.lock().expect("no panic").pop_front()
+        };
+        let Some(interrupted) = next else {
+            return self.inner.put_opts(path, payload, options).await;
+        };
+        let bytes: Vec<u8> = payload.iter().flatten().copied().collect();
+        let kept = match interrupted {
+            Interrupted::Whole => bytes.len(),
+            Interrupted::Half => bytes.len() / 2,
+        };
+        let payload = bytes[..kept].to_vec().into();
+        self.inner.put_opts(path, payload, options).await?;
+        Err(Error::Generic {
+            store: "flaky",
+            source: "no answer".into(),
+        })
     }
 
     async fn put_multipart_opts(
@@ -82,6 +127,9 @@ impl ObjectStore for Flaky {
     async fn get_opts(&self, path: &Path, options: GetOptions) -> Result<GetResult> {
         self.check()?;
         tokio::time::sleep(Duration::from_millis(self.get_ms.load(Ordering::Relaxed))).await;
+        while self.held.load(Ordering::Relaxed) {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
         self.inner.get_opts(path, options).await
     }
 

@@ -3,10 +3,13 @@
 use std::{sync::Arc, time::Duration};
 
 use object_store::{memory::InMemory, path::Path};
-use surprised::memory::store::{Role, Store};
+use surprised::{
+    memory::store::{Role, Store},
+    model::mode::{Mode, Modes},
+};
 
 use super::{
-    flaky::Flaky,
+    flaky::{Flaky, Interrupted},
     rig::{STEP_M, Service},
 };
 
@@ -50,6 +53,34 @@ fn a_service_goes_on_in_ram_and_stores_everything_when_the_store_is_back() {
 }
 
 #[test]
+fn what_a_store_was_interrupted_at_is_written_again_unless_it_is_whole() {
+    let inner = Arc::new(InMemory::new());
+    let flaky = Flaky::new(inner.clone());
+    let store = Store::with_objects(flaky.clone(), at());
+    let mut service = Service::writer(&store);
+    flaky.interrupt([Interrupted::Half, Interrupted::Whole, Interrupted::Half]);
+    service.learn_row(4);
+    service.until("everything is stored", |service| {
+        let status = service.store.status();
+        flaky.to_interrupt() == 0 && status.pending == 0 && status.trouble.is_none()
+    });
+    assert!(service.store.status().write_failures > 0);
+    let learnt = service.content();
+    assert_eq!(learnt.len(), 4);
+    let said = Modes::said(None, Mode::Freeze);
+    flaky.interrupt([Interrupted::Half]);
+    service.store.say(&said);
+    service.until_stored();
+    service.crash();
+    let mut again = Service::writer(&Store::with_objects(inner, at()));
+    again.until_known(4);
+    assert_eq!(again.content(), learnt);
+    assert_eq!(again.store.status().damaged, 0);
+    assert_eq!(again.store.take_modes(), Some(said));
+    again.stop();
+}
+
+#[test]
 fn a_service_that_cannot_read_its_place_refuses_frames_until_it_can() {
     let inner = Arc::new(InMemory::new());
     let mut service = Service::writer(&Store::with_objects(inner.clone(), at()));
@@ -62,10 +93,13 @@ fn a_service_that_cannot_read_its_place_refuses_frames_until_it_can() {
     let refusal = service.store.may_learn().expect_err("nothing is known");
     assert_eq!(refusal.code, "memory_unread");
     assert!(refusal.detail.contains("cut off"), "{refusal}");
+    let refusal = service.store.may_recall().expect_err("nothing is known");
+    assert_eq!(refusal.code, "memory_unread");
     flaky.cut_off(false);
     service.until("it writes the place", |service| {
         service.store.role() == Role::Writer && service.memory.known() == 2
     });
+    service.store.may_recall().expect("it has been read");
     service.stop();
 }
 

@@ -1,16 +1,19 @@
 //! A place may be larger than RAM.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
 use object_store::{memory::InMemory, path::Path};
 use surprised::{
-    memory::store::{PlaceOptions, Store},
+    memory::store::{Brought, PlaceOptions, Store},
     model::frame::Source,
 };
 
 use super::{
     flaky::Flaky,
-    rig::{Backend, PLACE, STEP_M, Service, any_viewpoint, at, options, viewpoint_bytes},
+    rig::{Backend, DEADLINE, PLACE, STEP_M, Service, any_viewpoint, at, options, viewpoint_bytes},
 };
 
 /// Viewpoints in RAM, of [`KNOWN`].
@@ -140,5 +143,51 @@ fn a_frame_does_not_wait_long_for_a_store_that_is_gone() {
             .iter()
             .any(|viewpoint| viewpoint.id == 1)
     );
+    service.stop();
+}
+
+#[test]
+fn a_question_about_what_is_far_away_gives_its_turn_back_until_that_is_loaded() {
+    let flaky = Flaky::new(Arc::new(InMemory::new()));
+    let store = Store::with_objects(flaky.clone(), Path::from("walk"));
+    let mut service = Service::with(&store, PLACE, small());
+    service.until("it may learn", |service| service.store.may_learn().is_ok());
+    for index in 0..2 * ROOM {
+        service.learn(STEP_M * index as f64, index as u64);
+        if index % 20 == 0 {
+            service.until_stored();
+        }
+    }
+    service.until_stored();
+    let before = service.store.status();
+    flaky.hold_reads(true);
+    let mut since = None;
+    let Service { store, memory, .. } = &mut service;
+    for _ in 0..5 {
+        assert!(!store.bring_step(memory, &at(0.0), &mut since));
+        assert!(since.is_some());
+        // A frame of a robot that is where it was finds what it needs.
+        let here = at(STEP_M * (2 * ROOM - 1) as f64);
+        assert_eq!(store.bring(memory, &here), Brought::Hit);
+    }
+    flaky.hold_reads(false);
+    let end = Instant::now() + DEADLINE;
+    while !store.bring_step(memory, &at(0.0), &mut since) {
+        assert!(Instant::now() < end, "it is never there");
+    }
+    assert!(since.is_none(), "the next question begins anew");
+    assert!(
+        memory
+            .viewpoints()
+            .iter()
+            .any(|viewpoint| viewpoint.id == 1)
+    );
+    let after = store.status();
+    assert_eq!(
+        (after.misses - before.misses, after.hits - before.hits),
+        (1, 5),
+        "a question is counted once however often it waits"
+    );
+    assert_eq!(after.incomplete, before.incomplete);
     service.stop();
 }

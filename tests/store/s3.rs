@@ -3,7 +3,9 @@
 //! it. Without it this is skipped, loudly.
 
 use std::{
+    collections::BTreeSet,
     env,
+    fs::File,
     io::{Read, Write},
     net::{TcpListener, TcpStream},
     path::{Path as FilePath, PathBuf},
@@ -20,6 +22,7 @@ use object_store::{
 use tempfile::TempDir;
 
 use super::{
+    reference::Random,
     rig::{Backend, DEADLINE, STEP_M, Service},
     suite::SUITE,
 };
@@ -38,15 +41,22 @@ fn program() -> Option<PathBuf> {
         .find(|file| file.is_file())
 }
 
-fn free_port() -> u16 {
-    // The servers' second ports are these and ten thousand.
-    loop {
-        let listener = TcpListener::bind(("127.0.0.1", 0)).expect("a port");
-        let port = listener.local_addr().expect("an address").port();
-        if port < 55_000 {
-            return port;
+/// Free ports, each with a free one ten thousand above, where the servers have their second ones. All are below those
+/// that the system gives to whoever asks for any: they are still free when the servers start a second time.
+fn unasked_ports() -> [u16; 4] {
+    let mut random = Random(std::process::id().into());
+    let mut free = BTreeSet::new();
+    let end = Instant::now() + DEADLINE;
+    while free.len() < 4 {
+        assert!(Instant::now() < end, "no free ports");
+        let port = random.uniform(10_000.0, 22_000.0) as u16;
+        let is_free = |port| TcpListener::bind(("127.0.0.1", port)).is_ok();
+        if is_free(port) && is_free(port + 10_000) {
+            free.insert(port);
         }
     }
+    let mut ports = free.into_iter();
+    [0; 4].map(|_| ports.next().expect("four were found"))
 }
 
 struct Weed {
@@ -60,9 +70,9 @@ struct Weed {
 impl Weed {
     fn start(program: PathBuf) -> Self {
         let folder = TempDir::new().expect("a folder");
-        let ports = [0; 4].map(|_| free_port());
+        let ports = unasked_ports();
         let process = run(&program, folder.path(), ports);
-        let weed = Self {
+        let mut weed = Self {
             program,
             folder,
             ports,
@@ -73,12 +83,13 @@ impl Weed {
     }
 
     /// One plain request; the status.
-    fn ask(&self, request: &str) -> Option<u16> {
+    fn ask(&self, request: &str, body: &str) -> Option<u16> {
         let mut stream = TcpStream::connect(("127.0.0.1", self.ports[0])).ok()?;
         stream.set_read_timeout(Some(Duration::from_secs(5))).ok()?;
         write!(
             stream,
-            "{request} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
+            "{request} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {}\r\nConnection: close\r\n\r\n{body}",
+            body.len()
         )
         .ok()?;
         let mut answer = [0; 12];
@@ -86,18 +97,21 @@ impl Weed {
         std::str::from_utf8(&answer[9..]).ok()?.parse().ok()
     }
 
-    /// The bucket is there and takes an object.
-    fn until_ready(&self) {
+    /// The bucket is there and takes an object. The first one with content takes seconds longer than the bucket: a volume
+    /// is made for it.
+    fn until_ready(&mut self) {
         let end = Instant::now() + 2 * DEADLINE;
         loop {
-            let made = self.ask(&format!("PUT /{BUCKET}"));
-            let written = self.ask(&format!("PUT /{BUCKET}/ready"));
+            let made = self.ask(&format!("PUT /{BUCKET}"), "");
+            let written = self.ask(&format!("PUT /{BUCKET}/ready"), "yes");
             if matches!((made, written), (Some(200 | 409), Some(200))) {
                 return;
             }
+            let ended = self.process.try_wait().expect("it can be asked");
             assert!(
-                Instant::now() < end,
-                "SeaweedFS answers {made:?} {written:?}"
+                ended.is_none() && Instant::now() < end,
+                "SeaweedFS answers {made:?} {written:?}, ended {ended:?}: {}",
+                std::fs::read_to_string(log(self.folder.path())).unwrap_or_default()
             );
             std::thread::sleep(Duration::from_millis(100));
         }
@@ -145,8 +159,17 @@ impl Drop for Weed {
     }
 }
 
+fn log(folder: &FilePath) -> PathBuf {
+    folder.join("log")
+}
+
 fn run(program: &FilePath, folder: &FilePath, ports: [u16; 4]) -> Child {
     let [s3, master, volume, filer] = ports;
+    let log = File::options()
+        .create(true)
+        .append(true)
+        .open(log(folder))
+        .expect("a file");
     Command::new(program)
         .arg("server")
         .arg(format!("-dir={}", folder.display()))
@@ -157,8 +180,8 @@ fn run(program: &FilePath, folder: &FilePath, ports: [u16; 4]) -> Child {
         .arg(format!("-volume.port={volume}"))
         .arg(format!("-filer.port={filer}"))
         .stdin(Stdio::null())
-        .stdout(Stdio::null())
-        .stderr(Stdio::null())
+        .stdout(log.try_clone().expect("a file"))
+        .stderr(log)
         .spawn()
         .expect("weed starts")
 }

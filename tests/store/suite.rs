@@ -6,7 +6,11 @@ use futures_util::TryStreamExt;
 use object_store::{ObjectMeta, ObjectStoreExt, path::Path};
 use surprised::{
     memory::store::{Role, form},
-    model::viewpoint::Viewpoint,
+    model::{
+        frame::Source,
+        mode::{Mode, Modes},
+        viewpoint::Viewpoint,
+    },
 };
 
 use super::rig::{Backend, PLACE, STEP_M, Service};
@@ -37,6 +41,8 @@ on_every_backend! {
     a_second_service_takes_over_when_the_first_stops,
     a_second_service_takes_over_when_the_first_is_gone,
     places_are_apart_and_listed,
+    what_was_said_about_modes_holds_after_a_crash_and_for_who_takes_over,
+    damaged_modes_are_set_aside_and_what_was_said_before_holds,
 }
 
 /// Blocks on a look at the objects themselves.
@@ -315,6 +321,80 @@ fn a_second_service_takes_over_when_the_first_is_gone(backend: &Backend) {
     content.retain(|id, _| *id <= 3);
     assert_eq!(content, learnt);
     second.stop();
+}
+
+fn said_of(robot: &str, mode: Mode) -> Modes {
+    let source = Source {
+        robot: robot.into(),
+        camera: "head".into(),
+    };
+    Modes::said(Some(&source), mode)
+}
+
+fn what_was_said_about_modes_holds_after_a_crash_and_for_who_takes_over(backend: &Backend) {
+    let mut first = Service::writer(&backend.store());
+    assert_eq!(first.store.take_modes(), Some(Modes::default()));
+    assert_eq!(first.store.take_modes(), None, "nothing is new");
+    first.store.say(&said_of("anna", Mode::Learn));
+    let frozen = Modes::said(None, Mode::Freeze);
+    first.store.say(&frozen);
+    first.until_stored();
+    assert_eq!(first.store.take_modes(), Some(frozen.clone()));
+
+    // Another one follows, and keeps what it is told itself until the place is its own.
+    let mut second = Service::start(&backend.store());
+    second.until("it reads", |service| {
+        matches!(service.store.role(), Role::Reader { .. })
+    });
+    assert_eq!(second.store.take_modes(), Some(frozen.clone()));
+    let bert = said_of("bert", Mode::Observe);
+    second.store.say(&bert);
+    assert_eq!(second.store.take_modes(), Some(frozen.then(&bert)));
+    first.store.say(&said_of("anna", Mode::Observe));
+    first.until_stored();
+    let all = frozen.then(&said_of("anna", Mode::Observe)).then(&bert);
+    second.until("it has followed", |service| {
+        service.store.take_modes().as_ref() == Some(&all)
+    });
+    first.crash();
+    second.until("it has taken over", |service| {
+        service.store.role() == Role::Writer
+    });
+    second.until_stored();
+    second.crash();
+
+    let third = Service::writer(&backend.store());
+    assert_eq!(third.store.take_modes(), Some(all));
+    third.stop();
+    assert_eq!(objects_below(backend, "modes").len(), 1);
+}
+
+fn damaged_modes_are_set_aside_and_what_was_said_before_holds(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    let frozen = Modes::said(None, Mode::Freeze);
+    service.store.say(&frozen);
+    service.until_stored();
+    service.stop();
+    let before = objects_below(backend, "modes").swap_remove(0).location;
+    let (_, root) = backend.objects_at();
+    let newer = root
+        .join(PLACE)
+        .join("modes")
+        .join("00000001-00000000000000ff");
+    let mut bytes = read(backend, &before);
+    bytes[12] ^= 1;
+    write(backend, &newer, bytes);
+    let service = Service::writer(&backend.store());
+    assert_eq!(service.store.take_modes(), Some(frozen));
+    let status = service.store.status();
+    assert_eq!(status.damaged, 1);
+    assert!(
+        status.damaged_names[0].ends_with("damaged/modes-00000001-00000000000000ff"),
+        "{:?}",
+        status.damaged_names
+    );
+    service.stop();
+    assert_eq!(objects_below(backend, "modes").len(), 1);
 }
 
 fn places_are_apart_and_listed(backend: &Backend) {

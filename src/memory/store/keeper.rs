@@ -14,11 +14,15 @@ use super::{
     form::{self, FormError},
     lease::{Lease, Looked, RENEW_EVERY, Watcher},
     loader::{self, note_unreadable},
+    modes,
     place::{Known, NAMES_MAX, News, Role, Shared},
     shelf::{Listed, Result},
     writer,
 };
-use crate::{memory::Version, model::viewpoint::Head};
+use crate::{
+    memory::Version,
+    model::{mode::Modes, viewpoint::Head},
+};
 
 /// Heads read at once.
 const HEADS_AT_ONCE: usize = 32;
@@ -106,8 +110,11 @@ async fn tend(shared: &Shared, mut lease: Lease) -> Tended {
 /// Another service has taken the place: what is not stored here is of no use any more.
 fn lost(shared: &Shared) {
     let mut state = shared.lock();
-    let count = (state.pending.len() + state.writing) as u64;
+    let count = state.unstored() as u64;
     state.pending.clear();
+    state.modes_said = Modes::default();
+    state.modes_version = None;
+    state.modes_told = false;
     state.counters.lost += count;
     state.role = Role::Reader {
         holder: "another service".to_owned(),
@@ -195,11 +202,15 @@ async fn tidy(shared: &Shared, lease: &Lease) -> Result<()> {
     let read = refresh(shared).await?;
     shared.shelf.sweep().await?;
     shared.shelf.delete(&read.superseded, false).await?;
+    shared.shelf.delete_modes(&read.modes_superseded).await?;
+    for &version in &read.modes_damaged {
+        shared.shelf.set_modes_aside(version).await?;
+    }
     shared.shelf.delete_leases_before(lease.epoch).await?;
     for stranger in &read.strangers {
         shared.shelf.move_aside(stranger).await?;
     }
-    let found = read.strangers.len() + set_aside(shared).await?;
+    let found = read.strangers.len() + read.modes_damaged.len() + set_aside(shared).await?;
     // Also what was set aside in earlier times.
     let (names, count) = shared.shelf.damaged(NAMES_MAX).await?;
     let mut state = shared.lock();
@@ -260,6 +271,44 @@ async fn set_aside(shared: &Shared) -> Result<usize> {
 struct Read {
     superseded: Vec<(u64, Version)>,
     strangers: Vec<object_store::path::Path>,
+    modes_superseded: Vec<Version>,
+    modes_damaged: Vec<Version>,
+}
+
+/// Learns what is stored of the modes: the newest state that can be read.
+async fn refresh_modes(shared: &Shared, read: &mut Read) -> Result<()> {
+    let mut versions = shared.shelf.list_modes().await?;
+    while let Some(version) = versions.pop() {
+        if shared.lock().modes_version != Some(version) {
+            let got = match shared.shelf.get_modes(version, modes::BYTES_MAX).await {
+                // Superseded meanwhile.
+                Err(Error::NotFound { .. }) => continue,
+                got => got?,
+            };
+            let decoded = got.map_or(Err(FormError::TooLong), |bytes| modes::decode(&bytes));
+            let stored = match decoded {
+                Ok(stored) => stored,
+                Err(error) => {
+                    let path = shared.shelf.modes(version);
+                    tracing::error!(
+                        place = &*shared.place,
+                        "the modes in {path} are not used, but what was said before: {error}"
+                    );
+                    if error.is_damage() {
+                        read.modes_damaged.push(version);
+                    }
+                    continue;
+                }
+            };
+            let mut state = shared.lock();
+            state.modes = stored;
+            state.modes_version = Some(version);
+            state.modes_told = false;
+        }
+        break;
+    }
+    read.modes_superseded = versions;
+    Ok(())
 }
 
 /// Makes the catalogue what the store says, and tells the worker. Only heads that are not known yet are read.
@@ -277,6 +326,7 @@ async fn refresh(shared: &Shared) -> Result<Read> {
         strangers: listing.strangers,
         ..Read::default()
     };
+    refresh_modes(shared, &mut read).await?;
     let known: BTreeMap<u64, Version> = {
         let state = shared.lock();
         let catalogue = state.catalogue.iter();

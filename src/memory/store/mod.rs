@@ -12,6 +12,7 @@
 //! | queue | bound | beyond it |
 //! |---|---|---|
 //! | pending changes | one a viewpoint; they keep in RAM what the memory's own budget counts | the newest state wins; what is not stored cannot leave RAM, and when that fills the budget the nearest viewpoint is replaced, as without a store |
+//! | modes to be written | one, of the place | the newest wins |
 //! | wanted and loaded | [`loader::LOADS_MAX`] | what is only expected to be needed is dropped and counted |
 //!
 //! A change is written half of `write_behind_s` after it came, so that the other half is left for the writing. What took
@@ -27,6 +28,8 @@ mod keeper;
 mod lease;
 
 mod loader;
+
+mod modes;
 
 mod place;
 
@@ -47,7 +50,7 @@ use object_store::{
 };
 use url::Url;
 
-pub use self::place::{PlaceOptions, PlaceStore, Role, StoreStatus};
+pub use self::place::{Brought, PlaceOptions, PlaceStore, ROLES, Role, StoreStatus};
 use self::shelf::Shelf;
 
 /// The longest pause between two tries to reach the store.
@@ -187,15 +190,24 @@ impl Store {
         let mut places = Vec::new();
         let all = self.objects.list_with_delimiter(Some(&self.at)).await?;
         for place in all.common_prefixes {
-            let viewpoints = place.clone().join(shelf::VIEWPOINTS);
-            let first = self.objects.list(Some(&viewpoints)).next().await;
-            if let (Some(object), Some(name)) = (first, place.filename()) {
-                object?;
+            if let Some(name) = place.filename()
+                && self.has(name).await?
+            {
                 places.push(name.to_owned());
             }
         }
         places.sort();
         Ok(places)
+    }
+
+    /// Whether there are viewpoints of a place.
+    ///
+    /// # Errors
+    /// A store that cannot be reached.
+    pub async fn has(&self, place: &str) -> Result<bool, StoreError> {
+        let viewpoints = self.at.clone().join(place).join(shelf::VIEWPOINTS);
+        let first = self.objects.list(Some(&viewpoints)).next().await;
+        Ok(first.transpose()?.is_some())
     }
 
     fn shelf(&self, place: &str) -> Shelf {

@@ -21,6 +21,7 @@ use crate::{
     memory::{Memory, Version, residency::Change},
     model::{
         frame::Source,
+        mode::Modes,
         pose::Pose,
         refusal::Refusal,
         viewpoint::{Head, Viewpoint},
@@ -34,6 +35,8 @@ const AHEAD_FACTOR: usize = 3;
 const NEED_FACTOR: usize = 2;
 /// A frame or question waits no longer for what it needs; it goes on with what is there.
 const BRING_WITHIN: Duration = Duration::from_secs(2);
+/// A question waits no longer at a time, so that frames are served in between: a pass of the engine takes as long.
+const BRING_STEP: Duration = Duration::from_millis(20);
 /// Viewpoints are loaded without being asked for while less than this share of the budget is used.
 const WARM_SHARE: (usize, usize) = (3, 4);
 const WARM_AT_ONCE: usize = 16;
@@ -96,10 +99,13 @@ pub enum Role {
     Writer,
 }
 
+/// What [`StoreStatus::role`] may be.
+pub const ROLES: [&str; 3] = ["unread", "reader", "writer"];
+
 /// For people and monitors.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct StoreStatus {
-    /// unread, reader or writer.
+    /// One of [`ROLES`].
     pub role: &'static str,
     /// Who writes the place, where it is not this service.
     pub holder: Option<String>,
@@ -163,7 +169,7 @@ pub(super) struct Unreadable {
     pub is_damaged: bool,
 }
 
-/// What the worker has to learn, in this order.
+/// What the worker has to learn of the viewpoints, in this order.
 #[derive(Debug)]
 pub(super) enum News {
     /// Everything is as the store says from here on.
@@ -187,6 +193,13 @@ pub(super) struct State {
     pub writing: usize,
     /// What is stored, by id.
     pub catalogue: BTreeMap<u64, Known>,
+    /// What is stored of the modes, and under which name.
+    pub modes: Modes,
+    pub modes_version: Option<Version>,
+    /// What was said about modes since, here. Who writes the place stores it.
+    pub modes_said: Modes,
+    /// The worker knows what these come to.
+    pub modes_told: bool,
     /// To be loaded, the next first.
     pub wanted: VecDeque<u64>,
     /// Being loaded.
@@ -208,6 +221,12 @@ pub(super) struct State {
 impl State {
     fn is_awaited(&self, id: u64) -> bool {
         self.fetching.contains(&id) || self.wanted.contains(&id)
+    }
+
+    /// Changes that are not stored yet.
+    pub fn unstored(&self) -> usize {
+        let modes = self.role == Role::Writer && !self.modes_said.is_empty();
+        self.pending.len() + self.writing + usize::from(modes)
     }
 
     /// Whether the lease of this epoch still allows to write.
@@ -345,15 +364,39 @@ impl PlaceStore {
                     "this place is written by another service ({holder}); this one answers questions and takes over when that one is gone"
                 ),
             )),
-            Role::Unread => {
-                let why = state.trouble.values().next();
-                let why = why.map_or("it is being read", String::as_str);
-                Err(Refusal::new(
-                    "memory_unread",
-                    format!("what is stored of this place is not known yet: {why}; trying on"),
-                ))
-            }
+            Role::Unread => Err(unread(&state)),
         }
+    }
+
+    /// A memory that has never been read expects nothing and knows no modes: whoever relied on it would be told that
+    /// nothing is surprising.
+    ///
+    /// # Errors
+    /// `memory_unread`.
+    pub fn may_recall(&self) -> Result<(), Refusal> {
+        let state = self.shared.lock();
+        match state.role {
+            Role::Unread => Err(unread(&state)),
+            _ => Ok(()),
+        }
+    }
+
+    /// What holds for the cameras, if that has changed since this was asked last.
+    pub fn take_modes(&self) -> Option<Modes> {
+        let mut state = self.shared.lock();
+        if state.modes_told {
+            return None;
+        }
+        state.modes_told = true;
+        Some(state.modes.then(&state.modes_said))
+    }
+
+    /// Keeps what is said about modes: at once where this service writes the place, else when it does.
+    pub fn say(&self, modes: &Modes) {
+        let mut state = self.shared.lock();
+        state.modes_said = state.modes_said.then(modes);
+        state.modes_told = false;
+        self.shared.for_writer.notify_one();
     }
 
     /// Tells the memory what is new and takes what has changed in it. To be called after every frame, and when woken.
@@ -431,18 +474,63 @@ impl PlaceStore {
         dropped
     }
 
-    /// Brings what a frame or a question at a pose needs into RAM. Waits for the store only where something lacks.
-    pub fn bring(&self, memory: &mut Memory, world_from_camera: &Pose) -> Brought {
+    /// What the memory needs for a frame or a question at a pose and has not in RAM.
+    fn lacks(&self, memory: &mut Memory, world_from_camera: &Pose) -> Vec<u64> {
         let options = &self.shared.options;
         memory.begin_turn();
         let count = NEED_FACTOR * options.views;
-        let needed = memory.need(world_from_camera, count, options.metres_per_radian);
+        memory.need(world_from_camera, count, options.metres_per_radian)
+    }
+
+    /// Brings what a question at a pose needs into RAM, a step at a time. `began`: when that began, of which the caller
+    /// keeps what is told here. True when everything is there, or nothing more will come in time.
+    pub fn bring_step(
+        &self,
+        memory: &mut Memory,
+        world_from_camera: &Pose,
+        began: &mut Option<Instant>,
+    ) -> bool {
+        let needed = self.lacks(memory, world_from_camera);
+        if needed.is_empty() {
+            if began.take().is_none() {
+                self.shared.lock().counters.hits += 1;
+            }
+            return true;
+        }
+        let is_first = began.is_none();
+        let since = *began.get_or_insert_with(Instant::now);
+        let step = Instant::now();
+        let is_complete = self.fetch(memory, needed, BRING_STEP);
+        let mut state = self.shared.lock();
+        state.counters.misses += u64::from(is_first);
+        state.counters.miss_seconds += step.elapsed().as_secs_f64();
+        let is_hopeless = state.trouble.contains_key(loader::READING);
+        let is_late = is_hopeless || since.elapsed() >= BRING_WITHIN;
+        if !is_complete && !is_late {
+            return false;
+        }
+        state.counters.incomplete += u64::from(!is_complete);
+        *began = None;
+        true
+    }
+
+    /// Loads these viewpoints, a step at a time; waits as long where the store cannot be reached.
+    pub fn fetch_step(&self, memory: &mut Memory, ids: Vec<u64>) {
+        if !self.fetch(memory, ids, BRING_STEP) {
+            let is_hopeless = |state: &State| state.trouble.contains_key(loader::READING);
+            self.wait(BRING_STEP, |state| !is_hopeless(state));
+        }
+    }
+
+    /// Brings what a frame at a pose needs into RAM. Waits for the store only where something lacks.
+    pub fn bring(&self, memory: &mut Memory, world_from_camera: &Pose) -> Brought {
+        let needed = self.lacks(memory, world_from_camera);
         if needed.is_empty() {
             self.shared.lock().counters.hits += 1;
             return Brought::Hit;
         }
         let began = Instant::now();
-        let is_complete = self.fetch(memory, needed);
+        let is_complete = self.fetch(memory, needed, BRING_WITHIN);
         let mut state = self.shared.lock();
         state.counters.misses += 1;
         state.counters.miss_seconds += began.elapsed().as_secs_f64();
@@ -453,8 +541,8 @@ impl PlaceStore {
         Brought::Incomplete
     }
 
-    /// Loads these viewpoints and waits for them, but no longer than [`BRING_WITHIN`]; whether all are there.
-    pub fn fetch(&self, memory: &mut Memory, ids: Vec<u64>) -> bool {
+    /// Loads these viewpoints and waits for them, but no longer than that; whether all are there.
+    fn fetch(&self, memory: &mut Memory, ids: Vec<u64>, within: Duration) -> bool {
         let began = Instant::now();
         let mut left = ids;
         if left.is_empty() {
@@ -477,7 +565,7 @@ impl PlaceStore {
             if is_hopeless {
                 break;
             }
-            self.wait(BRING_WITHIN.saturating_sub(began.elapsed()), |state| {
+            self.wait(within.saturating_sub(began.elapsed()), |state| {
                 !left.iter().any(|id| state.is_awaited(*id))
             });
             self.sync(memory);
@@ -523,11 +611,11 @@ impl PlaceStore {
             .collect();
         let left_unread = state.unreadable.len() - damaged.len();
         StoreStatus {
-            role: match state.role {
-                Role::Unread => "unread",
-                Role::Reader { .. } => "reader",
-                Role::Writer => "writer",
-            },
+            role: ROLES[match state.role {
+                Role::Unread => 0,
+                Role::Reader { .. } => 1,
+                Role::Writer => 2,
+            }],
             holder: match &state.role {
                 Role::Reader { holder } => Some(holder.clone()),
                 _ => None,
@@ -542,7 +630,7 @@ impl PlaceStore {
                 aside.chain(damaged).take(NAMES_MAX).cloned().collect()
             },
             left_unread,
-            pending: state.pending.len() + state.writing,
+            pending: state.unstored(),
             pending_s: oldest.map_or(0.0, |since| since.elapsed().as_secs_f64()),
             ..state.counters.clone()
         }
@@ -555,11 +643,11 @@ impl PlaceStore {
         self.shared.tell_tasks();
         let closed = self.wait(within, |state| state.closed);
         let state = self.shared.lock();
-        let left = state.pending.len() + state.writing;
+        let left = state.unstored();
         if left > 0 {
             tracing::error!(
                 place = &*self.shared.place,
-                "{left} viewpoints could not be stored before the end"
+                "{left} changes could not be stored before the end"
             );
         }
         closed && left == 0
@@ -582,6 +670,15 @@ impl PlaceStore {
         }
         true
     }
+}
+
+fn unread(state: &State) -> Refusal {
+    let why = state.trouble.values().next();
+    let why = why.map_or("it is being read", String::as_str);
+    Refusal::new(
+        "memory_unread",
+        format!("what is stored of this place is not known yet: {why}; trying on"),
+    )
 }
 
 impl Drop for PlaceStore {

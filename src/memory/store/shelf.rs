@@ -3,6 +3,7 @@
 //! ```text
 //! PLACE/viewpoints/ID-EPOCH-REVISION    one object a viewpoint (see `form`); numbers in hexadecimal
 //! PLACE/lease/EPOCH                     who writes the place (see `lease`)
+//! PLACE/modes/EPOCH-REVISION            what was said about modes (see `modes`)
 //! PLACE/damaged/...                     what could not be read, under the name it had
 //! PLACE/lock                            on disk only: locked by the process that writes the place
 //! ```
@@ -27,6 +28,7 @@ use crate::memory::Version;
 
 pub const VIEWPOINTS: &str = "viewpoints";
 const LEASE: &str = "lease";
+const MODES: &str = "modes";
 const DAMAGED: &str = "damaged";
 const LOCK: &str = "lock";
 
@@ -73,6 +75,14 @@ impl Shelf {
             .join(format!("{id:016x}-{epoch:08x}-{revision:016x}"))
     }
 
+    pub fn modes(&self, version: Version) -> Path {
+        let Version { epoch, revision } = version;
+        self.at
+            .clone()
+            .join(MODES)
+            .join(format!("{epoch:08x}-{revision:016x}"))
+    }
+
     fn lease(&self, epoch: u64) -> Path {
         self.at.clone().join(LEASE).join(format!("{epoch:016x}"))
     }
@@ -117,14 +127,63 @@ impl Shelf {
         object.bytes().await.map(Some)
     }
 
-    /// Writes an object once; nothing happens where it is already.
+    /// Writes an object once; nothing happens where it is already as it should be.
     pub async fn put(&self, id: u64, version: Version, object: Bytes) -> Result<()> {
-        let path = self.viewpoint(id, version);
-        match self.create(&path, object).await {
-            // Only the holder of the epoch makes this name: an answer was lost on the way.
-            Err(Error::AlreadyExists { .. }) => Ok(()),
-            result => result,
+        self.put_once(&self.viewpoint(id, version), object).await
+    }
+
+    /// Only the holder of the epoch makes such a name: where there is one already, an answer was lost on the way, or
+    /// the store was while it wrote. What it has then is believed only if it is whole.
+    async fn put_once(&self, path: &Path, object: Bytes) -> Result<()> {
+        match self.create(path, object.clone()).await {
+            Err(Error::AlreadyExists { .. } | Error::Precondition { .. }) => {}
+            result => return result,
         }
+        let there = self.objects.get(path).await?;
+        if there.meta.size == object.len() as u64 && there.bytes().await? == object {
+            return Ok(());
+        }
+        tracing::warn!("{path} was left incomplete by the store: it is written again");
+        self.objects.put(path, object.into()).await?;
+        Ok(())
+    }
+
+    /// Which states of the modes there are, rising.
+    pub async fn list_modes(&self) -> Result<Vec<Version>> {
+        let mut versions = Vec::new();
+        let mut objects = self.objects.list(Some(&self.at.clone().join(MODES)));
+        while let Some(object) = objects.try_next().await? {
+            let name = object.location.filename().unwrap_or("");
+            // The form of a viewpoint's name without its id.
+            if let Some((_, version)) = parse(&format!("0-{name}")) {
+                versions.push(version);
+            }
+        }
+        versions.sort_unstable();
+        Ok(versions)
+    }
+
+    /// `None` if it is larger than `bytes_max`, which is not read.
+    pub async fn get_modes(&self, version: Version, bytes_max: u64) -> Result<Option<Bytes>> {
+        let object = self.objects.get(&self.modes(version)).await?;
+        if object.meta.size > bytes_max {
+            return Ok(None);
+        }
+        object.bytes().await.map(Some)
+    }
+
+    pub async fn put_modes(&self, version: Version, object: Bytes) -> Result<()> {
+        self.put_once(&self.modes(version), object).await
+    }
+
+    pub async fn delete_modes(&self, versions: &[Version]) -> Result<()> {
+        for &version in versions {
+            match self.objects.delete(&self.modes(version)).await {
+                Ok(()) | Err(Error::NotFound { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
     }
 
     async fn create(&self, path: &Path, object: Bytes) -> Result<()> {
@@ -153,8 +212,18 @@ impl Shelf {
         self.move_aside(&self.viewpoint(id, version)).await
     }
 
-    pub async fn move_aside(&self, path: &Path) -> Result<Path> {
+    pub async fn set_modes_aside(&self, version: Version) -> Result<Path> {
+        let path = self.modes(version);
         let name = path.filename().unwrap_or("nameless");
+        self.rename_aside(&path, &format!("modes-{name}")).await
+    }
+
+    pub async fn move_aside(&self, path: &Path) -> Result<Path> {
+        self.rename_aside(path, path.filename().unwrap_or("nameless"))
+            .await
+    }
+
+    async fn rename_aside(&self, path: &Path, name: &str) -> Result<Path> {
         let aside = self.at.clone().join(DAMAGED).join(name);
         self.objects.rename(path, &aside).await?;
         Ok(aside)

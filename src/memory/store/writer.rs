@@ -1,4 +1,5 @@
-//! Writes what has changed, some time after it changed: newest states only, several at once.
+//! Writes what has changed, some time after it changed: newest states only, several at once. What is said about modes is
+//! written at once.
 
 use std::{sync::Arc, time::Instant};
 
@@ -8,10 +9,11 @@ use tokio::{task::spawn_blocking, time};
 use super::{
     Backoff,
     form::{self, Label},
+    modes,
     place::{Known, News, Pending, Role, Shared},
     shelf,
 };
-use crate::memory::Version;
+use crate::{memory::Version, model::mode::Modes};
 
 /// Packing one takes some milliseconds of a processor, and most of a write is waiting.
 const WRITES_AT_ONCE: usize = 4;
@@ -23,6 +25,10 @@ enum Due {
     Batch {
         epoch: u64,
         changes: Vec<(u64, Pending)>,
+    },
+    Modes {
+        version: Version,
+        said: Modes,
     },
     At(Instant),
     Nothing,
@@ -49,6 +55,19 @@ pub async fn write(shared: Arc<Shared>) {
                     time::sleep(backoff.next()).await;
                 }
             }
+            Due::Modes { version, said } => {
+                let written = write_modes(&shared, version, said).await;
+                let trouble = written.err().map(|error| error.to_string());
+                let failed = trouble.is_some();
+                shared.trouble(WRITING, trouble);
+                shared.tell_worker();
+                if failed {
+                    shared.lock().counters.write_failures += 1;
+                    time::sleep(backoff.next()).await;
+                } else {
+                    backoff = Backoff::default();
+                }
+            }
         }
     }
 }
@@ -56,6 +75,15 @@ pub async fn write(shared: Arc<Shared>) {
 fn due(shared: &Shared) -> Due {
     let mut state = shared.lock();
     let epoch = state.epoch;
+    if !state.modes_said.is_empty() && state.may_write(epoch) {
+        // Of the states of one epoch the last counts.
+        let last = state.modes_version.filter(|last| last.epoch == epoch);
+        let revision = last.map_or(1, |last| last.revision + 1);
+        return Due::Modes {
+            version: Version { epoch, revision },
+            said: state.modes_said.clone(),
+        };
+    }
     let oldest = state.pending.values().map(|pending| pending.since).min();
     let Some(oldest) = oldest else {
         return if state.closing {
@@ -76,6 +104,32 @@ fn due(shared: &Shared) -> Due {
     let changes: Vec<(u64, Pending)> = std::mem::take(&mut state.pending).into_iter().collect();
     state.writing = changes.len();
     Due::Batch { epoch, changes }
+}
+
+/// Stores what holds after this was said, beside what held before.
+async fn write_modes(shared: &Shared, version: Version, said: Modes) -> shelf::Result<()> {
+    let (modes, before) = {
+        let state = shared.lock();
+        (state.modes.then(&said), state.modes_version)
+    };
+    let object = modes::encode(&modes).into();
+    shared.shelf.put_modes(version, object).await?;
+    {
+        let mut state = shared.lock();
+        if state.role != Role::Writer || state.epoch != version.epoch {
+            return Ok(());
+        }
+        // What was said while this was written is said after it.
+        if state.modes_said == said {
+            state.modes_said = Modes::default();
+        }
+        state.modes = modes;
+        state.modes_version = Some(version);
+    }
+    if let Some(before) = before {
+        shared.shelf.delete_modes(&[before]).await?;
+    }
+    Ok(())
 }
 
 /// False if some of it failed; that is pending again.

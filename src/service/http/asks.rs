@@ -30,7 +30,7 @@ use super::{
     App,
     extract::Path,
     message as described,
-    problem::{Document, Problem},
+    problem::{Problem, Unanswered},
 };
 use crate::{
     model::refusal::Refusal,
@@ -146,10 +146,7 @@ fn sent(media_type: &'static str, bytes: Vec<u8>, room: Option<OwnedSemaphorePer
     request_body = described::PriorRequest,
     responses(
         (status = 200, content((described::PriorReply = "application/json"), (Vec<u8> = "image/png"))),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn prior(
     State(app): State<App>,
@@ -159,7 +156,7 @@ async fn prior(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (mut request, _room): (proto::PriorRequest, _) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     if !names(&headers, header::ACCEPT, PNG) {
         let Held { reply: prior, room } = questions.prior(&place, &request).await?;
         return Ok(reply(&headers, &prior, room));
@@ -193,10 +190,7 @@ struct Borrowed {
     request_body = described::EvaluateRequest,
     responses(
         (status = 200, body = described::EvaluateReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn evaluate(
     State(app): State<App>,
@@ -208,7 +202,7 @@ async fn evaluate(
     let Query(Borrowed { robot, camera }) =
         borrowed.map_err(|_| bad("robot and camera are names"))?;
     let camera = camera_named(&robot, &camera)?;
-    let place = questions.place(&name)?;
+    let place = questions.places.known(&name).await?;
     let (head, body) = request.into_parts();
     // Room is made before the body is read: some of these are large.
     let length = head.headers.get(header::CONTENT_LENGTH);
@@ -232,10 +226,7 @@ async fn evaluate(
     request_body = described::NextViewRequest,
     responses(
         (status = 200, body = described::NextViewReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn next_view(
     State(app): State<App>,
@@ -245,7 +236,7 @@ async fn next_view(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (request, _room) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let ranked = questions.next_view(&place, &request).await?;
     Ok(reply(&headers, &ranked, None))
 }
@@ -256,10 +247,7 @@ async fn next_view(
     request_body = described::ForgetRequest,
     responses(
         (status = 200, body = described::ForgetReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn forget(
     State(app): State<App>,
@@ -269,7 +257,7 @@ async fn forget(
 ) -> Result<Response, Problem> {
     let questions = &app.parts.questions;
     let (request, _room) = request(questions, &headers, body)?;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let forgotten = questions.forget(&place, &request).await?;
     Ok(reply(&headers, &forgotten, None))
 }
@@ -288,10 +276,7 @@ struct Page {
     params(("place" = String, Path), Page),
     responses(
         (status = 200, body = described::ViewsReply),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn views(
     State(app): State<App>,
@@ -302,7 +287,7 @@ async fn views(
     let Query(Page { after, limit }) =
         page.map_err(|_| bad("after and limit are whole numbers"))?;
     let questions = &app.parts.questions;
-    let place = questions.place(&place)?;
+    let place = questions.places.known(&place).await?;
     let request = proto::ViewsRequest { after, limit };
     let views = questions.views(&place, &request).await?;
     Ok(reply(&headers, &views, None))
@@ -313,10 +298,7 @@ async fn views(
     params(("place" = String, Path)),
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn place_mode(
     State(app): State<App>,
@@ -333,10 +315,7 @@ async fn place_mode(
     request_body = described::Mode,
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn set_place_mode(
     State(app): State<App>,
@@ -361,10 +340,7 @@ fn camera_path(place: &str, robot: &str, camera: &str) -> Result<CameraPath, Pro
     params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn camera_mode(
     State(app): State<App>,
@@ -382,10 +358,7 @@ async fn camera_mode(
     request_body = described::Mode,
     responses(
         (status = 200, body = described::Mode),
-        (status = "4XX", description = "What is wrong with it, or no token", body = Document,
-            content_type = "application/problem+json"),
-        (status = 503, description = "Busy", body = Document, content_type = "application/problem+json"),
-        (status = 504, description = "Late", body = Document, content_type = "application/problem+json"),
+        Unanswered,
     ))]
 async fn set_camera_mode(
     State(app): State<App>,

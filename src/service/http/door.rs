@@ -189,8 +189,7 @@ pub async fn session(State(door): State<Arc<Door>>, headers: HeaderMap) -> axum:
     request_body = SignIn,
     responses(
         (status = 204, description = "The cookie is set; also where no token is needed"),
-        (status = "4XX", description = "Not the token, or no request", body = super::problem::Document,
-            content_type = "application/problem+json"),
+        super::problem::Refused,
     ))]
 pub async fn sign_in(
     State(door): State<Arc<Door>>,

@@ -338,8 +338,7 @@ async fn readyz(State(app): State<App>) -> Response {
 #[utoipa::path(get, path = "/metrics", tag = "service",
     responses(
         (status = 200, body = String, content_type = "application/openmetrics-text"),
-        (status = "4XX", description = "No token", body = problem::Document,
-            content_type = "application/problem+json"),
+        problem::Refused,
     ))]
 async fn prometheus(State(app): State<App>) -> Response {
     let text = metrics::text(&app.registry);
@@ -350,8 +349,7 @@ async fn prometheus(State(app): State<App>) -> Response {
 #[utoipa::path(get, path = "/api/v1/info", tag = "service",
     responses(
         (status = 200, body = Object),
-        (status = "4XX", description = "No token", body = problem::Document,
-            content_type = "application/problem+json"),
+        problem::Refused,
     ))]
 async fn info(State(app): State<App>) -> axum::Json<Value> {
     let places = &app.parts.places;

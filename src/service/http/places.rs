@@ -15,7 +15,7 @@ use super::{
     App,
     extract::Path,
     message,
-    problem::{Document, Problem},
+    problem::{Document, Problem, Refused},
 };
 use crate::{
     model::frame::{RgbImage, Source},
@@ -41,8 +41,7 @@ pub struct PlaceNames {
 #[utoipa::path(get, path = "/api/v1/places", tag = "places",
     responses(
         (status = 200, body = PlaceNames),
-        (status = "4XX", description = "No token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn list(State(app): State<App>) -> axum::Json<PlaceNames> {
     let places = app.parts.places.all();
@@ -54,11 +53,14 @@ pub async fn list(State(app): State<App>) -> axum::Json<PlaceNames> {
     })
 }
 
-pub fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
-    app.parts
-        .places
-        .get(place)
-        .ok_or_else(|| Problem::not_found("this place is unknown: it begins with its first frame"))
+pub async fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
+    let known = app.parts.places.known(place).await;
+    known.map_err(|refusal| match refusal.code {
+        "unknown_place" => {
+            Problem::not_found("this place is unknown: it begins with its first frame")
+        }
+        _ => refusal.into(),
+    })
 }
 
 /// A place and its cameras: state and counters
@@ -66,14 +68,13 @@ pub fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
     params(("place" = String, Path)),
     responses(
         (status = 200, body = PlaceState),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn status(
     State(app): State<App>,
     Path(place): Path<String>,
 ) -> Result<axum::Json<PlaceState>, Problem> {
-    let status = known(&app, &place)?.status.borrow().clone();
+    let status = known(&app, &place).await?.status.borrow().clone();
     Ok(axum::Json(app.parts.live.state_of(&status)))
 }
 
@@ -90,14 +91,13 @@ pub struct CameraReply {
     params(("place" = String, Path), ("robot" = String, Path), ("camera" = String, Path)),
     responses(
         (status = 200, body = CameraReply),
-        (status = "4XX", description = "No such camera, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn camera(
     State(app): State<App>,
     Path((place, robot, camera)): Path<(String, String, String)>,
 ) -> Result<axum::Json<Value>, Problem> {
-    let status = known(&app, &place)?.status.borrow().clone();
+    let status = known(&app, &place).await?.status.borrow().clone();
     let state = app.parts.live.state_of(&status);
     let camera = state
         .cameras
@@ -144,7 +144,7 @@ pub async fn picture(
             ));
         }
     };
-    let place = known(&app, &place)?;
+    let place = known(&app, &place).await?;
     let camera = Source {
         robot: robot.into(),
         camera: camera.into(),

@@ -8,7 +8,7 @@ use axum::{
     response::{IntoResponse, Response},
 };
 use serde::Serialize;
-use utoipa::ToSchema;
+use utoipa::{IntoResponses, ToSchema};
 
 use crate::model::refusal::Refusal;
 
@@ -34,6 +34,30 @@ pub struct Document {
     code: &'static str,
     /// One sentence, for people: what is wrong and what to do.
     detail: Cow<'static, str>,
+}
+
+/// For the description: how it may end otherwise.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "described, not made")]
+pub enum Refused {
+    /// What is wrong with it, or no token
+    #[response(status = "4XX", content_type = "application/problem+json")]
+    Refused(Document),
+}
+
+/// For the description: how a question to a place may end otherwise.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "described, not made")]
+pub enum Unanswered {
+    /// What is wrong with it, or no token
+    #[response(status = "4XX", content_type = "application/problem+json")]
+    Refused(Document),
+    /// Busy
+    #[response(status = 503, content_type = "application/problem+json")]
+    Busy(Document),
+    /// Late
+    #[response(status = 504, content_type = "application/problem+json")]
+    Late(Document),
 }
 
 impl Problem {
@@ -81,7 +105,7 @@ impl Problem {
 impl From<Refusal> for Problem {
     fn from(refusal: Refusal) -> Self {
         let status = match refusal.code {
-            "busy" | "closing" => StatusCode::SERVICE_UNAVAILABLE,
+            "busy" | "closing" | "memory_unread" => StatusCode::SERVICE_UNAVAILABLE,
             "late" => StatusCode::GATEWAY_TIMEOUT,
             "unknown_camera" | "unknown_place" => StatusCode::NOT_FOUND,
             "message_too_large" => StatusCode::PAYLOAD_TOO_LARGE,

@@ -21,7 +21,7 @@ use super::{
     extract::{Path, Query},
     message,
     places::known,
-    problem::{Document, Problem},
+    problem::{Document, Problem, Refused},
 };
 use crate::{
     service::{
@@ -263,8 +263,7 @@ pub struct EventList {
     params(("place" = String, Path), Wanted),
     responses(
         (status = 200, body = EventList),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn events(
     State(app): State<App>,
@@ -279,7 +278,7 @@ pub async fn events(
             format!("limit is between 1 and {LIST_MAX}"),
         ));
     }
-    let place = known(&app, &place)?;
+    let place = known(&app, &place).await?;
     // Before the list: what comes in between is in both.
     let last_event_id = app.parts.live.last_event_id();
     let events = place.events.borrow().clone();
@@ -298,8 +297,8 @@ pub async fn events(
     })))
 }
 
-fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> {
-    let events = known(app, place)?.events.borrow().clone();
+async fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> {
+    let events = known(app, place).await?.events.borrow().clone();
     let event = id.parse().ok().and_then(|id| events.get(id));
     event.cloned().ok_or_else(|| {
         Problem::not_found(
@@ -313,14 +312,15 @@ fn find(app: &App, place: &str, id: &str) -> Result<Arc<proto::Event>, Problem> 
     params(("place" = String, Path), ("event" = String, Path)),
     responses(
         (status = 200, body = message::Event),
-        (status = "4XX", description = "No such event, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn event(
     State(app): State<App>,
     Path((place, id)): Path<(String, String)>,
 ) -> Result<axum::Json<Value>, Problem> {
-    Ok(axum::Json(encode::event_json(&*find(&app, &place, &id)?)))
+    Ok(axum::Json(encode::event_json(
+        &*find(&app, &place, &id).await?,
+    )))
 }
 
 /// An event's box and its surroundings at its peak
@@ -329,14 +329,13 @@ pub async fn event(
         ("picture" = String, Path, description = "seen.jpg or expected.jpg")),
     responses(
         (status = 200, body = Vec<u8>, content_type = "image/jpeg"),
-        (status = "4XX", description = "No such picture, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn event_picture(
     State(app): State<App>,
     Path((place, id, picture)): Path<(String, String, String)>,
 ) -> Result<Response, Problem> {
-    let event = find(&app, &place, &id)?;
+    let event = find(&app, &place, &id).await?;
     let image = match picture.as_str() {
         "seen.jpg" => event.picture.as_ref(),
         "expected.jpg" => event.expected_picture.as_ref(),
@@ -360,14 +359,13 @@ pub struct Timeline {
     params(("place" = String, Path)),
     responses(
         (status = 200, body = Timeline),
-        (status = "4XX", description = "No such place, or no token", body = Document,
-            content_type = "application/problem+json"),
+        Refused,
     ))]
 pub async fn timeline(
     State(app): State<App>,
     Path(place): Path<String>,
 ) -> Result<axum::Json<Timeline>, Problem> {
-    known(&app, &place)?;
+    known(&app, &place).await?;
     Ok(axum::Json(Timeline {
         cameras: app.parts.live.timeline(&place),
         seconds_per_point: 1,

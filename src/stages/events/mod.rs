@@ -6,6 +6,7 @@
 //! - *Which is which*: a region belongs to the event that it was in before (its id says so), else to the nearest one whose
 //!   place is within [`SAME_WITHIN_M`], the size of a tabletop object, or within the larger one's half size, because
 //!   cameras on two sides of a thing see centres that far apart; never beyond [`SAME_WITHIN_MAX_M`].
+//! - *Where*: where its thing appears now; where that was before, it has left.
 //! - *New*: in two frames. In the second it need not surprise any more, because a camera that stands still learns a thing
 //!   at once: it is enough that its place still looks as it did when it surprised, rather than as it was expected. A
 //!   flicker of one frame does not; it is dropped when its camera sees the place without it.
@@ -253,6 +254,12 @@ impl Events {
             y_max,
         } = region.pixel_box;
         followed.half_size_px = side(x_min, x_max).max(side(y_min, y_max)) / 2.0;
+        // A hand that puts a cup down is one region with it: what counts is where and what it is when the hand is gone.
+        if followed.last_frame != self.frames
+            && placed.is_some_and(|placed| followed.has_left_for(&placed))
+        {
+            followed.best = None;
+        }
         let rank = (!region.touches_border, region.peak_surprise);
         if followed.best.is_none_or(|best| {
             (rank.0 && !best.0) || (rank.0 == best.0 && rank.1 > PEAK_RISE * best.1)
@@ -301,11 +308,7 @@ impl Events {
                     .flatten()
                     .map(|other| (other - center).norm());
                 let distance_m = distances.min_by(f64::total_cmp)?;
-                let within_m = SAME_WITHIN_M
-                    .max(extent.max())
-                    .max(event.extent_in_world.max())
-                    .min(SAME_WITHIN_MAX_M);
-                (distance_m < within_m).then_some((index, distance_m))
+                (distance_m < followed.reach_m(extent)).then_some((index, distance_m))
             })
             .min_by(|a, b| a.1.total_cmp(&b.1))
             .map(|(index, _)| index)
@@ -430,6 +433,19 @@ impl Events {
 }
 
 impl Followed {
+    /// How far from its place something of the given half sizes is still the same, metres.
+    fn reach_m(&self, extent: &Vector3<f64>) -> f64 {
+        SAME_WITHIN_M
+            .max(extent.max())
+            .max(self.event.extent_in_world.max())
+            .min(SAME_WITHIN_MAX_M)
+    }
+
+    fn has_left_for(&self, (center, extent): &(Point3<f64>, Vector3<f64>)) -> bool {
+        let before = self.event.center_in_world;
+        before.is_some_and(|before| (before - center).norm() >= self.reach_m(extent))
+    }
+
     fn known_by(&mut self, source: &Source, region_id: u64) {
         let known = self.known_by.iter();
         let mut known = known.filter(|(by, id)| by == source && *id == region_id);

@@ -36,25 +36,31 @@ dialog.addEventListener("click", (event) => {
   if (event.target === dialog) close();
 });
 
-byId("mode").addEventListener("change", async (event) => {
-  const place = shownPlace();
-  const camera = openCamera();
-  if (!camera) return;
+byId("mode").addEventListener("change", (event) => {
+  const isUnderWay = asked !== null;
   asked = event.target.value;
   objection = null;
   drawCamera();
-  try {
-    await request(`${cameraPath(place.name, camera.robot, camera.camera)}/mode`, {
-      method: "PUT",
-      json: { mode: asked },
-    });
-    camera.mode = asked;
-  } catch (trouble) {
-    objection = trouble.message;
+  if (!isUnderWay) setMode();
+});
+
+/** One request after the other: the last choice is the last that the service hears. */
+async function setMode() {
+  const place = shownPlace();
+  const camera = openCamera();
+  while (camera && asked !== null) {
+    const mode = asked;
+    try {
+      await request(`${cameraPath(place.name, camera.robot, camera.camera)}/mode`, { method: "PUT", json: { mode } });
+      camera.mode = mode;
+    } catch (trouble) {
+      objection = trouble.message;
+    }
+    if (asked === mode) asked = null;
   }
   asked = null;
   drawCamera();
-});
+}
 
 function drawMode(camera) {
   const known = camera.mode !== undefined;
