@@ -15,13 +15,18 @@ fn main() -> anyhow::Result<()> {
     let (script, telling): (_, &[u64]) = match name.as_str() {
         "tabletop" => (
             Script::tabletop(1),
+            // The way from Q1 to Q2, then a row for each of X1, X2 and X3: before, coming, acting, after.
             &[
-                1, 85, 170, 332, 339, 345, 465, 662, 674, 680, 800, 970, 979, 981, 983, 1010,
+                1, 85, 170, 465, 324, 332, 339, 345, 656, 666, 674, 680, 961, 971, 979, 983,
             ],
         ),
         "objects" => (
             Script::objects(1),
-            &[1, 250, 350, 355, 501, 627, 745, 751, 839, 1002, 1120, 1140],
+            // A row for what is brought, another for what is taken.
+            &[
+                343, 351, 356, 361, 619, 626, 632, 638, 738, 746, 751, 756, 994, 1002, 1007, 1012,
+                1113, 1121, 1126, 1131, 1354, 1362, 1367, 1372,
+            ],
         ),
         "patrol" => (
             Script::patrol(1),

@@ -365,3 +365,76 @@ fn a_ray_inside_a_sphere_meets_its_far_side() {
     let crossing = sphere.crossing(&ray, 1e-7, f64::INFINITY).unwrap();
     assert!((crossing.t - 0.75).abs() < 1e-12);
 }
+
+#[test]
+fn the_edge_of_a_shadow_is_as_soft_as_the_lamp_is_wide() {
+    const BOARD_M: f64 = 0.5;
+    let pose = looking(Point3::new(-0.2, -1.3, 1.5), Point3::new(-0.25, 0.05, 0.0));
+    let lit = Lighting::default();
+    let lamp = &lit.lamp;
+    let mut dark = lit.clone();
+    dark.lamp.irradiance = [0.0; 3];
+    let scene = |board: bool| {
+        let mut builder = Builder::new(ObjectId::ROOM);
+        builder.cuboid(Point3::new(0.0, 0.0, -0.1), [20.0, 20.0, 0.1], 0.0, grey());
+        if board {
+            let thin = [0.3, 0.3, 1e-3];
+            builder.cuboid(Point3::new(0.0, 0.0, BOARD_M), thin, 0.0, grey());
+        }
+        Scene::new(builder.primitives)
+    };
+    let green = |scene: &Scene, lighting: &Lighting| -> Vec<f32> {
+        let rendering = Tracer { scene, lighting }.render(&camera(), &pose);
+        rendering.radiance.iter().map(|colour| colour[1]).collect()
+    };
+    let (bare, boarded) = (scene(false), scene(true));
+    let (all, none, some) = (
+        green(&bare, &lit),
+        green(&bare, &dark),
+        green(&boarded, &lit),
+    );
+    // The share of the lamp that the board leaves to a point of the floor, from many points of the lamp.
+    let left_by_board = |point: &Point3<f64>| {
+        let axis = (lamp.center - point).normalize();
+        let right = axis.cross(&Vector3::y()).normalize();
+        let up = axis.cross(&right);
+        let steps = || (-15..=15).map(|step| f64::from(step) / 15.5);
+        let (mut seen, mut count) = (0.0, 0.0);
+        for (x, y) in steps().flat_map(|x| steps().map(move |y| (x, y))) {
+            if x * x + y * y <= 1.0 {
+                let towards = lamp.center + (right * x + up * y) * lamp.radius - point;
+                let through = point + towards * (BOARD_M / towards.z);
+                let hidden = through.x.abs() < 0.15 && through.y.abs() < 0.15;
+                seen += f64::from(!hidden);
+                count += 1.0;
+            }
+        }
+        seen / count
+    };
+    let (mut soft, mut wrong) = (0, 0.0);
+    for row in 0..camera().height {
+        for column in 0..camera().width {
+            let at = row * camera().width + column;
+            let (ray, _) = camera_ray(&camera(), &pose, column as f64, row as f64);
+            let over_board = ray.at((BOARD_M - ray.origin.z) / ray.direction.z);
+            // The board itself, and what is mixed with it at its rim.
+            if over_board.x.abs().max(over_board.y.abs()) < 0.17 {
+                continue;
+            }
+            let point = ray.at(-ray.origin.z / ray.direction.z);
+            let share = f64::from((some[at] - none[at]) / (all[at] - none[at]));
+            let expected = left_by_board(&point);
+            assert!(
+                (share - expected).abs() < 0.3,
+                "({column}, {row}): {share} of the lamp instead of {expected}"
+            );
+            if (0.1..0.9).contains(&expected) {
+                soft += 1;
+                wrong += (share - expected).abs();
+            }
+        }
+    }
+    assert!(soft > 1000, "the edge is wide: {soft} pixels");
+    let wrong = wrong / f64::from(soft);
+    assert!(wrong < 0.1, "off by {wrong} of the lamp on average");
+}

@@ -194,7 +194,7 @@ pub async fn drive(
     }
     drop(sender);
     let mut desk = Desk {
-        judge: Judge::new(&script.story),
+        judge: Judge::new(&script),
         script: script.clone(),
         announced: BTreeSet::new(),
         summary: Summary::default(),

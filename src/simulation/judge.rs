@@ -3,8 +3,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::{script::Capture, story::PERSON, story::Story};
-use crate::model::report::PixelBox;
+use super::{
+    afterimage::Afterimages,
+    script::{Capture, Script},
+    story::PERSON,
+};
+use crate::model::{camera::Intrinsics, report::PixelBox};
 
 /// A thing smaller than this in an image is not expected to be noticed there, pixels: evidence blocks need 12x12.
 const VISIBLE_PX: usize = 144;
@@ -14,7 +18,8 @@ const VISIBLE_FRAMES: u32 = 3;
 const SAME_IOU: f64 = 0.2;
 /// A region this close to something that changed has a reason (its shadow, its reflection), pixels.
 const NEAR_PX: u32 = 8;
-/// What a person hid or shaded may surprise for so long after the person is gone, frames.
+/// What a person hid or shaded may surprise for so long after the person is gone, frames. Where the person itself was,
+/// surprise tells nothing until a camera has come back: see [`Afterimages`].
 const PERSON_ECHO: u32 = 7;
 
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
@@ -45,18 +50,29 @@ pub struct Verdict {
 
 pub struct Judge {
     names: Vec<&'static str>,
+    /// Of each station.
+    cameras: Vec<Intrinsics>,
     things: Vec<Thing>,
     watches: BTreeMap<usize, Watch>,
+    /// All stations share a memory.
+    afterimages: Afterimages,
     /// Whether a followed region ever had a reason, by its id.
     regions: BTreeMap<u64, bool>,
 }
 
 impl Judge {
-    pub fn new(story: &Story) -> Self {
+    pub fn new(script: &Script) -> Self {
+        let items = &script.story.items;
         Self {
-            names: story.items.iter().map(|item| item.name).collect(),
-            things: vec![Thing::default(); story.items.len()],
+            names: items.iter().map(|item| item.name).collect(),
+            cameras: script
+                .stations
+                .iter()
+                .map(|station| station.rig.intrinsics)
+                .collect(),
+            things: vec![Thing::default(); items.len()],
             watches: BTreeMap::new(),
+            afterimages: Afterimages::default(),
             regions: BTreeMap::new(),
         }
     }
@@ -99,6 +115,10 @@ impl Judge {
             thing.visible += u32::from(thing.placed && standing.contains(&index) && visible);
         }
         let person = bounds(capture.middle.object.iter().map(|&id| id == PERSON), width);
+        let camera = &self.cameras[station];
+        let afterimage = self.afterimages.squares(camera, &capture.world_from_camera);
+        self.afterimages
+            .look(station, camera, &capture.world_from_camera, &capture.middle);
 
         regions
             .iter()
@@ -132,7 +152,9 @@ impl Judge {
                         Some(self.names[index])
                     }
                     (_, Some(_)) => Some("person"),
-                    _ if person_echoes => Some("where the person was"),
+                    _ if person_echoes || afterimage.touch(&region, NEAR_PX) => {
+                        Some("where the person was")
+                    }
                     _ => None,
                 };
                 *self.regions.entry(id).or_default() |= reason.is_some();

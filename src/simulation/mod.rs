@@ -35,4 +35,6 @@ pub mod script;
 
 pub mod write;
 
+pub mod afterimage;
+
 pub mod judge;

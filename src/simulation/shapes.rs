@@ -193,6 +193,8 @@ pub struct Disc {
 pub struct Solid {
     /// Outward normal and offset: inside is `normal . p <= offset`. The first six are three pairs of opposite faces.
     planes: Vec<(Vector3<f64>, f64)>,
+    /// Of each face: the directions of its texture's u and v.
+    axes: Vec<[Vector3<f64>; 2]>,
     origin: Point3<f64>,
     right: Vector3<f64>,
     bounds: Bounds,
@@ -202,6 +204,20 @@ impl Solid {
     /// Outward normal and offset of each face: inside is `normal . p <= offset`.
     pub fn planes(&self) -> &[(Vector3<f64>, f64)] {
         &self.planes
+    }
+
+    /// Where a ray meets the plane of a face, metres along the ray.
+    pub fn on_plane_of(&self, part: usize, ray: &Ray) -> f64 {
+        let (normal, offset) = &self.planes[part];
+        (offset - normal.dot(&ray.origin.coords)) / normal.dot(&ray.direction)
+    }
+
+    fn axes_of(&self, normal: &Vector3<f64>) -> [Vector3<f64>; 2] {
+        if normal.z.abs() > 0.99 {
+            [self.right, Vector3::z().cross(&self.right)]
+        } else {
+            [Vector3::z().cross(normal).normalize(), Vector3::z()]
+        }
     }
 
     /// A box standing on `origin` (the middle of its base), `size` along its own axes, turned about z.
@@ -223,15 +239,23 @@ impl Solid {
             (up, size.z),
             (-up, 0.0),
         ];
-        Self {
-            planes: planes
-                .into_iter()
-                .map(|(normal, reach)| (normal, normal.dot(&origin.coords) + reach))
-                .collect(),
+        let mut solid = Self {
+            planes: Vec::new(),
+            axes: Vec::new(),
             origin,
             right,
             bounds: Bounds::of(corners),
+        };
+        for (normal, reach) in planes {
+            solid.cut(normal, normal.dot(&origin.coords) + reach);
         }
+        solid
+    }
+
+    /// Leaves what lies below a plane.
+    fn cut(&mut self, normal: Vector3<f64>, offset: f64) {
+        self.axes.push(self.axes_of(&normal));
+        self.planes.push((normal, offset));
     }
 
     /// A cuboid whose top is a roof: two slopes (parts 6 and 7) that fall `drop` towards its front and back.
@@ -241,7 +265,7 @@ impl Solid {
         let ridge = origin + Vector3::z() * size.z;
         for side in [-1.0, 1.0] {
             let normal = (forward * (side * drop) + Vector3::z() * (size.y * 0.5)).normalize();
-            solid.planes.push((normal, normal.dot(&ridge.coords)));
+            solid.cut(normal, normal.dot(&ridge.coords));
         }
         solid
     }
@@ -421,18 +445,14 @@ impl Shape {
                 }
             }
             Self::Solid(solid) => {
-                let normal = solid.planes[part].0;
                 let offset = point - solid.origin;
-                let (u, v) = if normal.z.abs() > 0.99 {
-                    (
-                        offset.dot(&solid.right),
-                        offset.dot(&Vector3::z().cross(&solid.right)),
-                    )
-                } else {
-                    let right = Vector3::z().cross(&normal).normalize();
-                    (offset.dot(&right), offset.z)
-                };
-                Surface { normal, u, v, part }
+                let [right, up] = &solid.axes[part];
+                Surface {
+                    normal: solid.planes[part].0,
+                    u: offset.dot(right),
+                    v: offset.dot(up),
+                    part,
+                }
             }
         }
     }

@@ -6,7 +6,7 @@
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::{
-    LIFT, Path, Scratch, Tracer,
+    LIFT, Path, Scratch, Seen, Tracer,
     tiles::{TILE, Tile},
 };
 use crate::{
@@ -19,22 +19,31 @@ use crate::{
 
 const LAMP_SAMPLES: usize = 9;
 const SKY_SAMPLES: usize = 5;
-/// Where a sample is one of several of a pixel, or seen in a mirror or through glass.
+/// Where a sample is one of several of a pixel.
 const FEW_LAMP_SAMPLES: usize = 4;
 const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
 const GLASS_SHADOW: f32 = 0.9;
+/// Points in a mirror or behind glass that are no farther apart than this cube's side share their light, metres: about a
+/// pixel on the table.
+const CELL_M: f64 = 0.004;
 /// Of a smaller part in the pixel, shadows are not looked for.
 const WEAK: f32 = 0.3;
+
+/// Primitive and part.
+pub(super) type Face = (u32, u32);
+
+pub(super) fn face_of(hit: &Hit) -> Face {
+    (hit.primitive as u32, hit.crossing.part as u32)
+}
 
 /// How much of the sky and of the lamp a point on a surface sees, 0..1. Light changes slowly over a surface, so
 /// neighbouring pixels on the same face of the same primitive share it.
 #[derive(Clone, Copy)]
 pub(super) struct Lit {
-    /// Primitive and part.
-    pub(super) face: (usize, usize),
+    pub(super) face: Face,
     pub(super) sky: f32,
     pub(super) lamp: f32,
 }
@@ -95,15 +104,18 @@ impl LitView {
         // Of 32 bits, signed: the quickest conversion that truncates.
         let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
-        let face = (hit.primitive, hit.crossing.part);
+        let face = face_of(hit);
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
-        for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
-            for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
-                let near = across * along;
-                // Rectified cameras meet in whole rows.
-                if near < 1e-4 || column >= width || row >= height {
+        for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
+            // Rectified cameras meet in whole rows.
+            if along < 1e-4 || row >= height {
+                continue;
+            }
+            for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
+                if column >= width {
                     continue;
                 }
+                let near = across * along;
                 let at = row * width + column;
                 let lit = &self.lit[at];
                 let apart = (f64::from(self.depth_m[at]) - depth_m).abs();
@@ -124,7 +136,7 @@ impl LitView {
 
 /// Nothing, or glass, which has no light of its own.
 pub(super) const UNLIT: Lit = Lit {
-    face: (usize::MAX, 0),
+    face: (u32::MAX, 0),
     sky: 1.0,
     lamp: 1.0,
 };
@@ -164,7 +176,7 @@ fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
 /// `enough` and they differ by less than `lamp_range` and `sky_range`.
 fn shared(
     known: &[[Option<Lit>; TILE]; TILE],
-    face: (usize, usize),
+    face: Face,
     (column, row): (usize, usize),
     reach: usize,
     enough: usize,
@@ -229,7 +241,7 @@ fn in_beam(
 
 impl Tracer<'_> {
     /// Finds what may shade any of the points that a tile sees.
-    fn look_around(&self, tile: &mut Tile, seen: &[(usize, Path, f64, Option<Hit>)]) {
+    fn look_around(&self, tile: &mut Tile, seen: &[Seen]) {
         tile.reach = Bounds::of(
             seen.iter()
                 .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
@@ -265,7 +277,7 @@ impl Tracer<'_> {
     pub(super) fn light(
         &self,
         tile: &mut Tile,
-        seen: &[(usize, Path, f64, Option<Hit>)],
+        seen: &[Seen],
         beside: Option<&LitView>,
         lit: &mut [Lit],
         width: usize,
@@ -275,6 +287,16 @@ impl Tracer<'_> {
             return;
         };
         let place = |at: usize| (at % width - origin % width, at / width - origin / width);
+        self.look_around(tile, seen);
+        let tile = &*tile;
+        if tile.lamp.is_empty() && tile.sky.is_empty() {
+            for (at, path, _, hit) in seen {
+                if let Some(hit) = hit {
+                    lit[*at] = self.unshaded(path, hit);
+                }
+            }
+            return;
+        }
         let mut known = [[None::<Lit>; TILE]; TILE];
         if let Some(beside) = beside {
             let mut all = true;
@@ -294,8 +316,6 @@ impl Tracer<'_> {
                 return;
             }
         }
-        self.look_around(tile, seen);
-        let tile = &*tile;
         for step in [4, 2, 1] {
             // The coarsest lattice is centred in the tile.
             let phase = step / 4 * 2;
@@ -309,7 +329,7 @@ impl Tracer<'_> {
                 if known[row][column].is_some() || !on_lattice(column) || !on_lattice(row) {
                     continue;
                 }
-                let face = (hit.primitive, hit.crossing.part);
+                let face = face_of(&hit);
                 let shared = match step {
                     4 => None,
                     2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
@@ -322,6 +342,45 @@ impl Tracer<'_> {
                 lit[at] = light;
             }
         }
+    }
+
+    /// The light on a point that nothing shades: all of the lamp, unless it is turned away from it.
+    fn unshaded(&self, path: &Path, hit: &Hit) -> Lit {
+        let primitive = &self.scene.primitives()[hit.primitive];
+        if primitive.is_glass() {
+            return UNLIT;
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let outward = primitive.shape.normal(&point, hit.crossing.part);
+        let facing = path.ray.direction.dot(&outward) < 0.0;
+        let towards = outward.dot(&(self.lighting.lamp.center - point)) > 0.0;
+        Lit {
+            face: face_of(hit),
+            sky: 1.0,
+            lamp: f32::from(facing == towards),
+        }
+    }
+
+    /// [`Self::light_on`] what is seen in a mirror or through glass. Points of a face that lie close together share it.
+    pub(super) fn light_beyond(
+        &self,
+        path: &Path,
+        hit: &Hit,
+        tile: Option<&Tile>,
+        scratch: &mut Scratch,
+    ) -> Lit {
+        if path.bounces == 0 || path.weight < WEAK {
+            return self.light_on(path, hit, tile, scratch);
+        }
+        let point = path.ray.at(hit.crossing.t);
+        let cell = (point.coords / CELL_M).map(|x| x.floor() as i32);
+        let place = (face_of(hit), [cell.x, cell.y, cell.z]);
+        if let Some(lit) = scratch.beyond.get(&place) {
+            return *lit;
+        }
+        let lit = self.light_on(path, hit, tile, scratch);
+        scratch.beyond.insert(place, lit);
+        lit
     }
 
     pub(super) fn light_on(
@@ -337,7 +396,7 @@ impl Tracer<'_> {
         }
         if path.weight < WEAK {
             return Lit {
-                face: (hit.primitive, hit.crossing.part),
+                face: face_of(hit),
                 sky: 0.85,
                 lamp: 0.8,
             };
@@ -347,20 +406,18 @@ impl Tracer<'_> {
         let facing = path.ray.direction.dot(&outward) < 0.0;
         let normal = if facing { outward } else { -outward };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
-        // Seen in a mirror or through glass, fewer samples do.
-        let few = path.few || path.bounces > 0;
-        let sky = if few {
+        let sky = if path.few {
             Self::sky_share::<FEW_SKY_SAMPLES>
         } else {
             Self::sky_share::<SKY_SAMPLES>
         };
-        let lamp = if few {
+        let lamp = if path.few {
             Self::lamp_share::<FEW_LAMP_SAMPLES>
         } else {
             Self::lamp_share::<LAMP_SAMPLES>
         };
         Lit {
-            face: (hit.primitive, hit.crossing.part),
+            face: face_of(hit),
             sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
             lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
                 lamp(self, &point, own, path.twist, tile, scratch)

@@ -10,18 +10,21 @@ mod light;
 mod shade;
 mod tiles;
 
+use std::{collections::HashMap, ops::Range};
+
+use arrayvec::ArrayVec;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
 pub use self::{light::LitView, shade::refracted};
 use self::{
-    light::{Lit, UNLIT},
+    light::{Face, Lit, UNLIT, face_of},
     shade::{Paint, plus},
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
 use super::{
-    scene::{ObjectId, Primitive, Scene},
-    shapes::{Bounds, Ray},
+    scene::{Finish, Hit, ObjectId, Primitive, Scene},
+    shapes::{Bounds, Crossing, Ray, Shape},
     texture::{Rgb, scaled},
 };
 use crate::{
@@ -96,12 +99,19 @@ pub struct Tracer<'a> {
     pub lighting: &'a Lighting,
 }
 
-/// Reused per row.
+/// Reused per tile.
 #[derive(Default)]
 struct Scratch {
     casters: Vec<u32>,
     paints: Vec<Option<Paint>>,
+    seen: Vec<Seen>,
+    /// Light on what is seen in mirrors and through glass, by face and place; of one row, or band, of pixels, so that it
+    /// does not depend on which of them a thread takes.
+    beyond: HashMap<(Face, [i32; 3]), Lit>,
 }
+
+/// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
+type Seen = (usize, Path, f64, Option<Hit>);
 
 /// A ray on its way.
 #[derive(Clone, Copy)]
@@ -226,6 +236,7 @@ impl Tracer<'_> {
             .map_init(
                 Scratch::default,
                 |scratch, (band, ((((radiance, depth), through), object), lit))| {
+                    scratch.beyond.clear();
                     let top = band * TILE;
                     let height = radiance.len() / width;
                     let rows = top..top + height;
@@ -249,19 +260,32 @@ impl Tracer<'_> {
                                 frame.nearest_m(shape).max(print.nearest_m)
                             })
                         });
-                        let mut seen = Vec::with_capacity(TILE * TILE);
+                        let mut seen = std::mem::take(&mut scratch.seen);
+                        seen.clear();
                         for row in 0..height {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
                                 let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
-                                let hit = self.first(&path.ray, &tile, u, v);
-                                seen.push((row * width + column, path, cos, hit));
+                                seen.push((row * width + column, path, cos, None));
                             }
                         }
+                        self.look(&tile, &mut seen, left..right, rows.clone());
                         self.light(&mut tile, &seen, beside, lit, width, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
                         self.paint(isa, &seen, &mut paints);
-                        for ((at, path, cos, hit), &paint) in seen.into_iter().zip(&paints) {
+                        for (&(at, path, cos, hit), &paint) in seen.iter().zip(&paints) {
+                            let matte = hit.zip(paint).filter(|(hit, _)| {
+                                let material = &self.scene.primitives()[hit.primitive].material;
+                                material.finish == Finish::Matte
+                            });
+                            if let Some((hit, paint)) = matte {
+                                let point = path.ray.at(hit.crossing.t);
+                                radiance[at] = self.diffuse(&point, &paint, lit[at]);
+                                depth[at] = (hit.crossing.t * cos) as f32;
+                                through[at] = depth[at];
+                                object[at] = self.scene.primitives()[hit.primitive].object;
+                                continue;
+                            }
                             let near = Near {
                                 lit: Some(lit[at]),
                                 view: beside,
@@ -286,6 +310,7 @@ impl Tracer<'_> {
                             };
                         }
                         scratch.paints = paints;
+                        scratch.seen = seen;
                         tiles.push(tile);
                     }
                     tiles
@@ -300,8 +325,10 @@ impl Tracer<'_> {
             .par_chunks_mut(width)
             .enumerate()
             .for_each_init(Scratch::default, |scratch, (row, radiance)| {
+                scratch.beyond.clear();
                 for (column, radiance) in radiance.iter_mut().enumerate() {
-                    if !rough(camera, &rendering.object, lit, &first, column, row) {
+                    let more = more_samples(camera, &rendering.object, lit, &first, column, row);
+                    if more == 0 {
                         continue;
                     }
                     let here = row * width + column;
@@ -317,8 +344,15 @@ impl Tracer<'_> {
                         .into_iter()
                         .flatten()
                         .all(|there| lit[there].face != UNLIT.face);
+                    let mut nearby = ArrayVec::<usize, 5>::new();
+                    for at in around.into_iter().flatten() {
+                        let primitive = lit[at].face.0 as usize;
+                        if !nearby.contains(&primitive) {
+                            nearby.push(primitive);
+                        }
+                    }
                     // Glass is looked through again for every sample.
-                    let offsets = if clear { &SAMPLES[..] } else { &SAMPLES[..2] };
+                    let offsets = &SAMPLES[..if clear { more } else { 2 }];
                     let share = 1.0 / (offsets.len() + 1) as f32;
                     let mut sum = scaled(*radiance, share);
                     for (index, &(du, dv)) in offsets.iter().enumerate() {
@@ -326,7 +360,7 @@ impl Tracer<'_> {
                         let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
                         // Where there is no glass, what is seen here is seen at one of these pixels.
                         let hit = if clear {
-                            self.first_of(&path.ray, around.map(|at| at.map(|at| lit[at].face.0)))
+                            self.first_of(&path.ray, &nearby)
                         } else {
                             None
                         }
@@ -334,9 +368,10 @@ impl Tracer<'_> {
                         // What the pixel or one beside it shows of the same face: its texture and light are averaged
                         // over a pixel already, and do not differ much.
                         let known = hit.and_then(|hit| {
-                            around.into_iter().flatten().find(|&there| {
-                                lit[there].face == (hit.primitive, hit.crossing.part)
-                            })
+                            around
+                                .into_iter()
+                                .flatten()
+                                .find(|&there| lit[there].face == face_of(&hit))
                         });
                         let near = Near {
                             lit: None,
@@ -357,32 +392,80 @@ impl Tracer<'_> {
     }
 }
 
-/// Does a pixel differ from one of its neighbours in surface, or strongly in colour?
-fn rough(
+impl Tracer<'_> {
+    /// Finds what each ray of a tile meets.
+    fn look(&self, tile: &Tile, seen: &mut [Seen], columns: Range<usize>, rows: Range<usize>) {
+        let (across, last) = (columns.len(), seen.len() - 1);
+        let flat = self.flat(
+            tile,
+            [
+                (0, columns.start, rows.start),
+                (across - 1, columns.end - 1, rows.start),
+                (last + 1 - across, columns.start, rows.end - 1),
+                (last, columns.end - 1, rows.end - 1),
+            ]
+            .map(|(index, column, row)| (&seen[index].1.ray, column, row)),
+        );
+        let face = flat.and_then(|hit| match &self.scene.primitives()[hit.primitive].shape {
+            Shape::Solid(solid) => Some((solid, hit)),
+            _ => None,
+        });
+        match face {
+            Some((solid, hit)) => {
+                for (_, path, _, met) in seen {
+                    let crossing = Crossing {
+                        t: solid.on_plane_of(hit.crossing.part, &path.ray),
+                        ..hit.crossing
+                    };
+                    *met = Some(Hit { crossing, ..hit });
+                }
+            }
+            None => {
+                let places = rows.flat_map(|row| columns.clone().map(move |column| (column, row)));
+                for ((_, path, _, met), (column, row)) in seen.iter_mut().zip(places) {
+                    *met = self.first(&path.ray, tile, column, row);
+                }
+            }
+        }
+    }
+}
+
+/// How many more samples a pixel needs: none where it is like its neighbours, all of [`SAMPLES`] where one of them has
+/// another colour, two where one shows another object of about the same colour.
+fn more_samples(
     camera: &Intrinsics,
     object: &[ObjectId],
     lit: &[Lit],
     radiance: &[Rgb],
     column: usize,
     row: usize,
-) -> bool {
+) -> usize {
     let width = camera.width;
     let here = row * width + column;
-    let differs = |there: usize| {
-        let (a, b) = (radiance[here], radiance[there]);
-        if object[here] != object[there] {
-            return true;
-        }
+    let needed = |there: usize| {
         // Textures are averaged over the pixel already; what is seen through glass is not.
         if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
-            return false;
+            return 0;
         }
-        (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05))
+        let (a, b) = (radiance[here], radiance[there]);
+        let contrast = (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05));
+        match (contrast, object[here] != object[there]) {
+            (true, _) => SAMPLES.len(),
+            (false, true) => 2,
+            (false, false) => 0,
+        }
     };
-    (column > 0 && differs(here - 1))
-        || (column + 1 < width && differs(here + 1))
-        || (row > 0 && differs(here - width))
-        || (row + 1 < camera.height && differs(here + width))
+    [
+        (column > 0).then(|| here - 1),
+        (column + 1 < width).then_some(here + 1),
+        (row > 0).then(|| here - width),
+        (row + 1 < camera.height).then_some(here + width),
+    ]
+    .into_iter()
+    .flatten()
+    .map(needed)
+    .max()
+    .unwrap_or(0)
 }
 
 /// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the

@@ -4,7 +4,7 @@ use std::sync::LazyLock;
 
 use nalgebra::{Point3, Vector3};
 
-use super::{LIFT, Near, Path, Scratch, Tracer, light::Lit, tiles::TILE};
+use super::{LIFT, Near, Path, Scratch, Seen, Tracer, light::Lit, tiles::TILE};
 use crate::{
     isa::Isa,
     lanes::LANES,
@@ -65,12 +65,7 @@ pub(super) struct Paint {
 
 impl Tracer<'_> {
     /// The surface that each of a tile's rays meets. Its pattern is evaluated for many rays at once.
-    pub(super) fn paint(
-        &self,
-        isa: Isa,
-        seen: &[(usize, Path, f64, Option<Hit>)],
-        paints: &mut Vec<Option<Paint>>,
-    ) {
+    pub(super) fn paint(&self, isa: Isa, seen: &[Seen], paints: &mut Vec<Option<Paint>>) {
         paints.clear();
         let mut spots = [Spot::default(); TILE * TILE];
         // Which rays wait for their colour.
@@ -173,7 +168,7 @@ impl Tracer<'_> {
                 let lit = near
                     .lit
                     .or_else(|| near.view?.light_at(hit, &path.ray.at(hit.crossing.t)))
-                    .unwrap_or_else(|| self.light_on(path, hit, near.tile, scratch));
+                    .unwrap_or_else(|| self.light_beyond(path, hit, near.tile, scratch));
                 self.opaque(path, hit, finish, lit, near, scratch)
             }
         }
@@ -245,11 +240,36 @@ impl Tracer<'_> {
         if path.bounces > 1 || !entering {
             return plus(through, scaled(self.surroundings(&reflection), share));
         }
-        let reflected = plus(
-            self.trace(&onward(reflection, share), near, scratch),
-            self.highlights(&point, &reflection, 0.08),
-        );
+        let seen = if path.weight * share > FAINT {
+            self.trace(&onward(reflection, share), near, scratch)
+        } else {
+            self.surroundings(&reflection)
+        };
+        let reflected = plus(seen, self.highlights(&point, &reflection, 0.08));
         plus(through, scaled(reflected, share))
+    }
+
+    /// The light that a surface scatters.
+    #[inline]
+    pub(super) fn diffuse(&self, point: &Point3<f64>, paint: &Paint, lit: Lit) -> Rgb {
+        let normal = &paint.normal;
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        let sky = plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        );
+        let lamp = &lighting.lamp;
+        let to_lamp = lamp.center - point;
+        let distance = to_lamp.norm();
+        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
+        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
+        let light = plus(
+            scaled(sky, lit.sky),
+            scaled(lamp.irradiance, lit.lamp * falloff),
+        );
+        times(paint.colour, light)
     }
 
     fn opaque(
@@ -277,23 +297,15 @@ impl Tracer<'_> {
             }
         });
         let travelled = path.travelled + hit.crossing.t;
-        let lighting = self.lighting;
-        let up = (0.5 + 0.5 * normal.z) as f32;
-        let (towards, window) = &lighting.window;
-        let sky = plus(
-            mixed(lighting.ground, lighting.sky, up),
-            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        let diffuse = self.diffuse(
+            &point,
+            &Paint {
+                normal,
+                cos,
+                colour,
+            },
+            lit,
         );
-        let lamp = &lighting.lamp;
-        let to_lamp = lamp.center - point;
-        let distance = to_lamp.norm();
-        let facing = (normal.dot(&to_lamp) / distance).max(0.0);
-        let falloff = ((lamp.reference_m / distance).powi(2) * facing) as f32;
-        let light = plus(
-            scaled(sky, lit.sky),
-            scaled(lamp.irradiance, lit.lamp * falloff),
-        );
-        let diffuse = times(colour, light);
         let Finish::Glossy {
             reflectance,
             sharpness,

@@ -186,20 +186,10 @@ impl Tracer<'_> {
     }
 
     /// The nearest hit of a ray with one of these primitives.
-    pub(super) fn first_of<const N: usize>(
-        &self,
-        ray: &Ray,
-        primitives: [Option<usize>; N],
-    ) -> Option<Hit> {
+    pub(super) fn first_of(&self, ray: &Ray, primitives: &[usize]) -> Option<Hit> {
         let mut best: Option<Hit> = None;
         let mut t_max = f64::INFINITY;
-        for (index, primitive) in primitives.iter().enumerate() {
-            let Some(primitive) = *primitive else {
-                continue;
-            };
-            if primitives[..index].contains(&Some(primitive)) {
-                continue;
-            }
+        for &primitive in primitives {
             let shape = &self.scene.primitives()[primitive].shape;
             if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
                 t_max = crossing.t;
@@ -210,6 +200,40 @@ impl Tracer<'_> {
             }
         }
         best
+    }
+
+    /// If all that a tile shows is one flat face: where one of its corner pixels meets it. `corners`: their rays, columns
+    /// and rows.
+    pub(super) fn flat(&self, tile: &Tile, corners: [(&Ray, usize, usize); 4]) -> Option<Hit> {
+        let mut farthest: Option<Hit> = None;
+        for (ray, column, row) in corners {
+            let hit = self.first(ray, tile, column, row)?;
+            if let Some(before) = farthest
+                && (before.primitive, before.crossing.part) != (hit.primitive, hit.crossing.part)
+            {
+                return None;
+            }
+            farthest = match farthest {
+                Some(before) if before.crossing.t >= hit.crossing.t => farthest,
+                _ => Some(hit),
+            };
+        }
+        let hit = farthest?;
+        let Shape::Solid(solid) = &self.scene.primitives()[hit.primitive].shape else {
+            return None;
+        };
+        let (normal, offset) = &solid.planes()[hit.crossing.part];
+        let before_face = |primitive: usize| {
+            let bounds = &self.scene.bounds()[primitive];
+            normal.dot(&bounds.center().coords) + normal.abs().dot(&bounds.half()) > offset + 1e-9
+        };
+        // A face of a convex solid that holds the corners holds all between them, none of it farther than the farthest
+        // corner.
+        tile.seen
+            .iter()
+            .take_while(|print| print.nearest_m <= hit.crossing.t)
+            .all(|print| print.primitive == hit.primitive || !before_face(print.primitive))
+            .then_some(hit)
     }
 
     /// The nearest hit of a ray through this pixel of the tile.
