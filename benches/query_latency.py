@@ -14,6 +14,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -115,7 +116,12 @@ def main(binary=ROOT / "target" / "release" / "surprised", seconds=8.0):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{listener.getsockname()[1]}"
-    service = subprocess.Popen([binary, "serve", "-l", endpoint, "--http", "off"], stderr=subprocess.DEVNULL)
+    # Stored as anybody's memory is, but nobody's is touched.
+    folder = tempfile.TemporaryDirectory()
+    service = subprocess.Popen(
+        [binary, "serve", "-l", endpoint, "--http", "off", "--memory", Path(folder.name).as_uri()],
+        stderr=subprocess.DEVNULL,
+    )
     config = zenoh.Config()
     config.insert_json5("connect/endpoints", json.dumps([endpoint]))
     config.insert_json5("scouting/multicast/enabled", "false")
@@ -178,6 +184,7 @@ def main(binary=ROOT / "target" / "release" / "surprised", seconds=8.0):
     finally:
         service.terminate()
         service.wait()
+        folder.cleanup()
 
 
 if __name__ == "__main__":
