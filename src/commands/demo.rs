@@ -55,7 +55,14 @@ impl Demo {
             Some(addr) => println!("The page is at http://{addr}/ - Ctrl-C ends it"),
             None => println!("no HTTP - Ctrl-C ends it"),
         }
-        println!("The robots get to know the table first; then things come and go.");
+        let eyes = match sensors {
+            Sensors::Depth => "a depth camera",
+            Sensors::Rig => "three cameras and tracked markers",
+        };
+        println!(
+            "Robots: {}, each with {eyes}. They get to know the table first; then things come and go.",
+            self.world.robots
+        );
 
         let (stopper, stop) = watch::channel(false);
         let signals = stop_signal()?;

@@ -273,38 +273,31 @@ impl Tracer<'_> {
     }
 
     /// Finds the light on every point that a tile sees: exactly at every sixteenth pixel, at every fourth where those
-    /// of the tile differ, and between these where the edge of a shadow is; at none that the camera `beside` sees too.
+    /// of the tile, `columns` wide, differ, and between these where the edge of a shadow is; at none that the camera
+    /// `beside` sees too.
     pub(super) fn light(
         &self,
         tile: &mut Tile,
         seen: &[Seen],
         beside: Option<&LitView>,
         lit: &mut [Lit],
-        width: usize,
+        columns: usize,
         scratch: &mut Scratch,
     ) {
-        let Some(&(origin, ..)) = seen.first() else {
-            return;
+        let places = || {
+            let rows = seen.chunks(columns).enumerate();
+            rows.flat_map(|(row, line)| {
+                let places = line.iter().enumerate();
+                places.map(move |(column, seen)| (column, row, seen))
+            })
         };
-        let place = |at: usize| (at % width - origin % width, at / width - origin / width);
-        self.look_around(tile, seen);
-        let tile = &*tile;
-        if tile.lamp.is_empty() && tile.sky.is_empty() {
-            for (at, path, _, hit) in seen {
-                if let Some(hit) = hit {
-                    lit[*at] = self.unshaded(path, hit);
-                }
-            }
-            return;
-        }
         let mut known = [[None::<Lit>; TILE]; TILE];
         if let Some(beside) = beside {
             let mut all = true;
-            for &(at, ref path, _, hit) in seen {
+            for (column, row, &(at, ref path, _, hit)) in places() {
                 let Some(hit) = hit else {
                     continue;
                 };
-                let (column, row) = place(at);
                 let light = beside.light_at(&hit, &path.ray.at(hit.crossing.t));
                 known[row][column] = light;
                 match light {
@@ -316,13 +309,22 @@ impl Tracer<'_> {
                 return;
             }
         }
+        self.look_around(tile, seen);
+        let tile = &*tile;
+        if tile.lamp.is_empty() && tile.sky.is_empty() {
+            for (at, path, _, hit) in seen {
+                if let Some(hit) = hit {
+                    lit[*at] = self.unshaded(path, hit);
+                }
+            }
+            return;
+        }
         for step in [4, 2, 1] {
             // The coarsest lattice is centred in the tile.
             let phase = step / 4 * 2;
             let on_lattice = |i: usize| i % step == phase;
             let before = known;
-            for &(at, ref path, _, hit) in seen {
-                let (column, row) = place(at);
+            for (column, row, &(at, ref path, _, hit)) in places() {
                 let Some(hit) = hit else {
                     continue;
                 };

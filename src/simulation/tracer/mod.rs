@@ -270,7 +270,7 @@ impl Tracer<'_> {
                             }
                         }
                         self.look(&tile, &mut seen, left..right, rows.clone());
-                        self.light(&mut tile, &seen, beside, lit, width, scratch);
+                        self.light(&mut tile, &seen, beside, lit, right - left, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
                         self.paint(isa, &seen, &mut paints);
                         for (&(at, path, cos, hit), &paint) in seen.iter().zip(&paints) {
