@@ -4,11 +4,14 @@
     target/venv/bin/python benches/depth_against_sgbm.py ../shared/data/tsukuba
 
 Prints the time of the processor for one thread and of the clock for two, best and median of the repetitions in turns.
-One thread of a Xeon with AVX-512, milliseconds of the processor, 64 labels; of SGBM's median:
+A Xeon with AVX-512, two cores; median milliseconds, and their share of SGBM's median; 64 labels. One thread: of the
+processor. Two threads: of the clock, on a machine whose cores others used too.
 
-    size      SGBM-HH, 2 cameras   ours, 3 cameras          ours, 2 cameras
-    320x240   14.8 to 15.2         17.6 to 18.9 (1.16-1.27) 16.5 to 17.5 (1.09-1.17)
-    640x480   91.7                 61.5 (0.67)              55.8 (0.61)
+    size     threads  SGBM-HH, 2 cameras  ours, 3 cameras  ours, 2 cameras
+    320x240  1         14.4               13.9 (0.97)      13.2 (0.92)
+    320x240  2         20.3               21.3 (1.05)      20.2 (1.00)
+    640x480  1         89.3               49.3 (0.55)      45.0 (0.50)
+    640x480  2        124.0               66.2 (0.53)      60.1 (0.48)
 """
 
 import pathlib

@@ -1,6 +1,8 @@
 //! Size and speed of stored viewpoints beside others that could have been, on viewpoints that a pipeline learnt from real
-//! recordings: `cargo bench --bench store -- FOLDER...`, each a recording in TUM RGB-D layout. `10000@FOLDER` makes a place
-//! of so many viewpoints of it instead, of which 256 MiB may be in RAM, and walks through it.
+//! recordings: `cargo bench --bench store -- FOLDER...`, each a recording in TUM RGB-D layout.
+//!
+//! `10000@FOLDER=PLACES` makes a place of so many viewpoints of a recording instead, in a row of 3 cm steps, in the folder
+//! PLACES (8 GB for 10,000), for `benches/large_place.py`, which walks a robot through it.
 //!
 //! Measured with an earlier program of the same transforms on two cores of a shared machine, 320x240 pixels of 2.76 MB
 //! raw (32 bytes of belief and 4 of depth a pixel), milliseconds a viewpoint:
@@ -51,8 +53,14 @@ fn main() {
         .skip(1)
         .filter(|word| !word.starts_with("--"));
     for folder in words {
-        if let Some((count, folder)) = folder.split_once('@') {
-            large_place(&learn(Path::new(folder)), count.parse().expect("a number"));
+        if let Some((count, folders)) = folder.split_once('@') {
+            let (folder, places) = folders.split_once('=').expect("COUNT@FOLDER=PLACES");
+            let viewpoints = learn(Path::new(folder));
+            make_large_place(
+                &viewpoints,
+                count.parse().expect("a number"),
+                Path::new(places),
+            );
             continue;
         }
         let viewpoints = learn(Path::new(&folder));
@@ -87,36 +95,26 @@ fn main() {
     }
 }
 
-/// Stores so many viewpoints along a way, leaves them, and walks along a part of it.
-fn large_place(viewpoints: &[Arc<Viewpoint>], count: usize) {
+/// Stores so many viewpoints along a way, as place `row`.
+fn make_large_place(viewpoints: &[Arc<Viewpoint>], count: usize, places: &Path) {
     const STEP_M: f64 = 0.03;
-    const SPEED_M_S: f64 = 0.3;
-    const PERIOD: Duration = Duration::from_millis(140);
-    const FRAMES: usize = 250;
     let settings = Settings {
         memory_bytes: 256 << 20,
         ..Settings::robust()
     };
-    let folder = tempfile::tempdir().expect("a folder");
-    let store = Store::in_folder(folder.path().to_owned()).expect("a folder");
+    let store = Store::in_folder(places.to_owned()).expect("a folder");
     let runtime = tokio::runtime::Runtime::new().expect("a runtime");
-    let open = || {
-        let options = PlaceOptions::new(&settings);
-        let place = PlaceStore::open(&store, "bench", options, runtime.handle(), || {});
-        let mut memory = Memory::default();
-        while place.may_learn().is_err() {
-            place.wait_read(Duration::from_millis(20));
-        }
-        place.sync(&mut memory);
-        (place, memory)
-    };
-    let at = |x_m: f64| Pose::translation(x_m, 0.0, 0.0);
-
-    let (place, mut memory) = open();
+    let options = PlaceOptions::new(&settings);
+    let place = PlaceStore::open(&store, "row", options, runtime.handle(), || {});
+    let mut memory = Memory::default();
+    while place.may_learn().is_err() {
+        place.wait_read(Duration::from_millis(20));
+    }
+    place.sync(&mut memory);
     let began = Instant::now();
     for index in 0..count {
         let mut viewpoint = (*viewpoints[index % viewpoints.len()]).clone();
-        viewpoint.world_from_camera = at(STEP_M * index as f64);
+        viewpoint.world_from_camera = Pose::translation(STEP_M * index as f64, 0.0, 0.0);
         viewpoint.world_from_home = viewpoint.world_from_camera;
         memory.begin_turn();
         memory.write(Slot::Append, viewpoint);
@@ -130,54 +128,10 @@ fn large_place(viewpoints: &[Arc<Viewpoint>], count: usize) {
         place.close(&mut memory, Duration::from_secs(600)),
         "all is stored"
     );
-    drop((place, memory));
     println!(
-        "{count} viewpoints stored in {:.0} s",
-        began.elapsed().as_secs_f64()
-    );
-
-    let began = Instant::now();
-    let (place, mut memory) = open();
-    println!(
-        "{} known again after {:.2} s, {:.0} MB on disk",
-        memory.known(),
+        "{count} viewpoints stored in {:.0} s, {:.0} MB on disk",
         began.elapsed().as_secs_f64(),
         place.status().stored_bytes as f64 / 1e6
-    );
-    let source = Source {
-        robot: "bench".into(),
-        camera: "camera".into(),
-    };
-    let (mut work, mut longest) = (Duration::ZERO, Duration::ZERO);
-    let start_m = STEP_M * count as f64 / 2.0;
-    for frame in 0..FRAMES {
-        let passed = PERIOD * frame as u32;
-        let pose = at(start_m + SPEED_M_S * passed.as_secs_f64());
-        let began = Instant::now();
-        place.sync(&mut memory);
-        place.bring(&mut memory, &pose);
-        place.prefetch(&mut memory, &source, (passed.as_nanos() as i64, pose));
-        let took = began.elapsed();
-        if frame > 0 {
-            work += took;
-            longest = longest.max(took);
-        }
-        std::thread::sleep(PERIOD.saturating_sub(took));
-    }
-    let status = place.status();
-    let peak = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let peak = peak
-        .lines()
-        .find(|line| line.starts_with("VmHWM"))
-        .unwrap_or("");
-    println!(
-        "{FRAMES} frames at {SPEED_M_S} m/s: {} hits, {} misses of {:.1} ms in all; then {:.2} ms a frame, the longest {:.2} ms; {} left RAM; {peak}",
-        status.hits,
-        status.misses,
-        1e3 * status.miss_seconds,
-        1e3 * work.as_secs_f64() / (FRAMES - 1) as f64,
-        1e3 * longest.as_secs_f64(),
-        memory.evicted(),
     );
 }
 

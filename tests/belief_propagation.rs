@@ -122,7 +122,7 @@ impl Grid {
     }
 }
 
-fn reference(settings: &PropagationSettings, finest: Grid, contrast: &Contrast) -> Vec<u8> {
+fn reference(settings: &PropagationSettings, finest: Grid, contrasts: &[Contrast]) -> Vec<u8> {
     let mut levels = vec![finest];
     while levels.len() < settings.levels
         && levels
@@ -141,6 +141,7 @@ fn reference(settings: &PropagationSettings, finest: Grid, contrast: &Contrast) 
             level.start_from(coarser);
         }
         let width = level.width;
+        let contrast = &contrasts[at];
         let smoothness = |a: (usize, usize), b: (usize, usize)| {
             let first = a.min(b);
             let differ = if a.1 == b.1 {
@@ -149,7 +150,7 @@ fn reference(settings: &PropagationSettings, finest: Grid, contrast: &Contrast) 
                 &contrast.below
             };
             // The upper or left one of the two; both orders agree, as one coordinate is equal.
-            if at == 0 && differ[first.1 * width + first.0] > 0 {
+            if differ[first.1 * width + first.0] > 0 {
                 settings.across_contrast
             } else {
                 settings.smooth
@@ -234,17 +235,23 @@ fn believes_as_the_reference(case: &Case) {
     let costs: Vec<u8> = (0..width * height * labels)
         .map(|_| (u16::from(random()) * u16::from(highest_cost) / 255) as u8)
         .collect();
-    let contrast = Contrast {
-        right: (0..width * height).map(|_| random() & 1).collect(),
-        below: (0..width * height).map(|_| random() & 1).collect(),
-    };
+    let contrasts: Vec<Contrast> = (0..settings.levels)
+        .map(|level| {
+            let pixels = width.div_ceil(1 << level) * height.div_ceil(1 << level);
+            let mut edges = || (0..pixels).map(|_| random() & 1).collect();
+            Contrast {
+                right: edges(),
+                below: edges(),
+            }
+        })
+        .collect();
     let finest = Grid::new(
         width,
         height,
         labels,
         costs.iter().map(|c| i32::from(*c)).collect(),
     );
-    let expected = reference(&settings, finest, &contrast);
+    let expected = reference(&settings, finest, &contrasts);
     for isa in Isa::available() {
         for threads in [1, 2, 3] {
             let pool = rayon::ThreadPoolBuilder::new()
@@ -266,7 +273,7 @@ fn believes_as_the_reference(case: &Case) {
                             }
                         },
                     );
-                    propagation.set_contrast(&contrast);
+                    propagation.set_contrasts(&contrasts);
                     propagation.solve().to_vec()
                 });
                 let got: Vec<u8> = beliefs.iter().map(|belief| belief.label).collect();

@@ -26,6 +26,8 @@ pub struct WithinLabel {
     pub label_step: f64,
     /// Everything nearer than the farthest label but glass.
     pub within_one_label: Option<f64>,
+    /// Of these, over those that are given a depth.
+    pub within_one_label_of_valid: Option<f64>,
     /// Of these, against the truth at the pixel's centre alone.
     pub within_one_label_at_centre: Option<f64>,
     /// Of these, mixtures.
@@ -85,7 +87,7 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
     let intrinsics = script.stations[0].rig.intrinsics;
     let quartered = quartered(script, &intrinsics);
     let mut all = Share::default();
-    let [mut at_centre, mut mixed, mut invalid] = [(); 3].map(|()| Share::default());
+    let [mut of_valid, mut at_centre, mut mixed, mut invalid] = [(); 4].map(|()| Share::default());
     let [mut cloth, mut others, mut glass, mut behind] = [(); 4].map(|()| Share::default());
     let mut errors: Vec<f32> = Vec::new();
     for &frame in frames {
@@ -126,6 +128,9 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
             let is_mixed = 1.0 / nearest - 1.0 / farthest > computed.label_step;
             let good = near(true_m) || is_mixed && quarters.into_iter().any(near);
             all.add(good);
+            if computed_m > 0.0 {
+                of_valid.add(good);
+            }
             at_centre.add(near(true_m));
             mixed.add(is_mixed);
             let share = if on_cloth { &mut cloth } else { &mut others };
@@ -142,6 +147,7 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
         labels: range.labels,
         label_step: range.step(),
         within_one_label: all.percent(),
+        within_one_label_of_valid: of_valid.percent(),
         within_one_label_at_centre: at_centre.percent(),
         mixed: mixed.percent(),
         cloth: cloth.percent(),

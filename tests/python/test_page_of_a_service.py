@@ -127,3 +127,32 @@ def test_a_picture_that_never_comes_does_not_stop_the_others(chromium, daemon, s
         card_of(visited.page, other).get_by_text("waiting for a frame").first.wait_for()
         report = settled.show()
         card_of(visited.page, settled).get_by_role("img", name=f"sees, frame {report.sequence}").wait_for()
+
+
+@pytest.fixture
+def guarded(tmp_path):
+    """A service with a token, and the token."""
+    file = tmp_path / "token"
+    file.write_text("correct-horse-battery-staple\n")
+    daemon = Daemon("--http-token-file", str(file))
+    yield daemon, file.read_text().strip()
+    daemon.end()
+
+
+def test_who_has_the_token_signs_in_and_watches(chromium, guarded):
+    daemon, token = guarded
+    with visit(chromium, daemon.http, **DESKTOP) as visited, open_session(daemon.endpoint) as session:
+        page = visited.page
+        page.get_by_role("heading", name="This service asks who you are").wait_for()
+        robot = Robot(session, "vault")
+        robot.show()
+        form = page.locator("#token-form")
+        form.get_by_label("Token").fill("battery-staple-horse-correct")
+        page.keyboard.press("Enter")
+        page.get_by_text("That token is not the right one.").wait_for()
+        assert not card_of(page, robot).count(), "nothing is shown to strangers"
+        form.get_by_label("Token").fill(token)
+        page.keyboard.press("Enter")
+        form.wait_for(state="hidden")
+        card_of(page, robot).get_by_role("img", name=re.compile(r"sees, frame \d+")).wait_for()
+        assert all(token not in url for url in visited.requests)

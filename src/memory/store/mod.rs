@@ -13,7 +13,7 @@
 //! |---|---|---|
 //! | pending changes | one a viewpoint; they keep in RAM what the memory's own budget counts | the newest state wins; what is not stored cannot leave RAM, and when that fills the budget the nearest viewpoint is replaced, as without a store |
 //! | modes to be written | one, of the place | the newest wins |
-//! | wanted and loaded | [`loader::LOADS_MAX`] | what is only expected to be needed is dropped and counted |
+//! | wanted and loaded | [`loader::LOADS_MAX`], and a quarter of the memory's budget | what is only expected to be needed is dropped and counted |
 //!
 //! A change is written half of `write_behind_s` after it came, so that the other half is left for the writing. What took
 //! longer all the same is counted as late: frames never wait for a slow store. While the store cannot be reached, the

@@ -40,6 +40,8 @@ const BRING_STEP: Duration = Duration::from_millis(20);
 /// Viewpoints are loaded without being asked for while less than this share of the budget is used.
 const WARM_SHARE: (usize, usize) = (3, 4);
 const WARM_AT_ONCE: usize = 16;
+/// What is being loaded takes no more than one part in so many of the budget beside it.
+const LOADS_SHARE: usize = 4;
 /// Robots whose way is followed.
 const WAYS_MAX: usize = 64;
 /// Damaged objects that are named; there may be more.
@@ -452,19 +454,28 @@ impl PlaceStore {
         }
         let mut state = self.shared.lock();
         if state.wanted.is_empty() && state.fetching.is_empty() {
-            self.want(&mut state, some);
+            self.want(&mut state, some, self.loads_max(memory));
         }
     }
 
+    /// How many may be on their way that are only expected to be needed: what comes beside the budget stays small.
+    fn loads_max(&self, memory: &Memory) -> usize {
+        let mean = memory.bytes() / memory.viewpoints().len().max(1);
+        let share = self.shared.options.memory_bytes / LOADS_SHARE;
+        let fit = share.checked_div(mean).unwrap_or(LOADS_MAX);
+        let needed = NEED_FACTOR * self.shared.options.views;
+        fit.clamp(needed.min(LOADS_MAX), LOADS_MAX)
+    }
+
     /// How many could not be asked for.
-    fn want(&self, state: &mut State, ids: Vec<u64>) -> u64 {
+    fn want(&self, state: &mut State, ids: Vec<u64>, loads_max: usize) -> u64 {
         let mut dropped = 0;
         for id in ids {
             if state.is_awaited(id) || state.loaded.contains(&id) {
                 continue;
             }
             let under_way = state.wanted.len() + state.fetching.len() + state.loaded.len();
-            if under_way >= LOADS_MAX {
+            if under_way >= loads_max {
                 dropped += 1;
                 continue;
             }
@@ -589,13 +600,14 @@ impl PlaceStore {
             return;
         };
         let options = &self.shared.options;
+        let loads_max = self.loads_max(memory);
         for ahead_s in AHEAD_S {
             let pose = way::ahead(&before, &passed, ahead_s);
             let count = AHEAD_FACTOR * options.views;
             let expected = memory.need(&pose, count, options.metres_per_radian);
             if !expected.is_empty() {
                 let mut state = self.shared.lock();
-                let dropped = self.want(&mut state, expected);
+                let dropped = self.want(&mut state, expected, loads_max);
                 state.counters.not_prefetched += dropped;
             }
         }

@@ -4,8 +4,8 @@
 //! Open in the paper: everything but the method. Chosen: messages of 8 bits, which lose nothing: no message exceeds
 //! its truncation d, so a cost of more than its pixel's least + 4 d never changes a message nor wins, and is cut at
 //! least + 4 d + 1; with d <= 31, the sum of a cost and four messages is at most 249. Two smoothness classes, so that
-//! depth may jump where luminance does. Coarser levels sum the costs of 2x2 pixels exactly (in 16 bits, cut likewise
-//! per level) and know one class only.
+//! depth may jump where luminance does, at each level. Coarser levels sum the costs of 2x2 pixels exactly (in 16 bits,
+//! cut likewise per level).
 //!
 //! Time goes into memory, not arithmetic, if each iteration walks the whole volume. So the iterations follow one
 //! another down the image one row apart, which is exact on a checkerboard: iteration t at row y needs iteration t - 1
@@ -37,7 +37,7 @@ impl Smoothness {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PropagationSettings {
-    /// Between neighbours of like luminance, and at all coarse levels.
+    /// Between neighbours of like luminance.
     pub smooth: Smoothness,
     /// Between neighbours of unlike luminance.
     pub across_contrast: Smoothness,
@@ -141,9 +141,12 @@ impl BeliefPropagation {
         &self.levels[0].costs
     }
 
-    /// Sets where depth may jump more cheaply; without, nowhere.
-    pub fn set_contrast(&mut self, contrast: &Contrast) {
-        self.levels[0].weigh(&self.settings, Some(contrast));
+    /// Sets where depth may jump more cheaply, the finest level first; without, nowhere. Levels beyond those that
+    /// there are have no effect.
+    pub fn set_contrasts(&mut self, contrasts: &[Contrast]) {
+        for (level, contrast) in self.levels.iter_mut().zip(contrasts) {
+            level.weigh(&self.settings, Some(contrast));
+        }
     }
 
     /// Sets the costs of the next [`solve`](Self::solve), row by row: `fill_row(state, y, row)` with a state from `init`
