@@ -16,7 +16,7 @@
 //! 0.4. Recall waits for memory: without its prefetches a frame takes a fifth longer, and on large pages
 //! (`GLIBC_TUNABLES=glibc.malloc.hugetlb=1`) `paper` takes 6.8. `peers.py`, least of 60: at 320x240 `paper` 7.3, `robust`
 //! 12.9, remap of 70 planes 13.2, interleaved 5.1, MOG2 2.3, KNN 4.7, NumPy + SciPy 12.4; at 640x480 27.2, 50.0, 49.5, 17.9,
-//! 9.8, 20.7, 58.6. Refinement is done by one thread.
+//! 9.8, 20.7, 58.6. Refinement is done by one thread. Seven of 1,000,000 viewpoints are selected in 0.006 ms.
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
