@@ -21,16 +21,13 @@ use crate::{
         mode::Mode,
         pose::Pose,
         report::Report,
-        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint},
     },
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
         depth::{InverseDepthRange, SidesDepth, given},
         events::{Events, Look},
-        interpolate::{
-            merge::VIEWS_MAX,
-            prior::{self, Prior},
-        },
+        interpolate::prior::{self, Prior},
         next_view::{self, Promise},
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
         update::UpdateRules,
@@ -61,7 +58,7 @@ pub struct Maps {
 #[derive(Debug, Clone, Default)]
 pub struct PriorAt {
     pub prior: Prior,
-    pub viewpoints_used: Vec<u64>,
+    pub viewpoints_used: ArrayVec<u64, VIEWS_MAX>,
 }
 
 /// A part of a frame's way. A pipeline has no clock: it says when a part has ended, and who has a clock may time it.
@@ -512,7 +509,7 @@ impl Pipeline {
             .select(world_from_camera, &self.settings, selected);
     }
 
-    fn ids(&self, selected: &[usize]) -> Vec<u64> {
+    fn ids(&self, selected: &[usize]) -> ArrayVec<u64, VIEWS_MAX> {
         selected
             .iter()
             .map(|&index| self.memory.viewpoints()[index].id)

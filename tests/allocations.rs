@@ -1,5 +1,5 @@
-//! A pipeline in its steady state, which overwrites a viewpoint with every frame, allocates nothing but the report's
-//! list of viewpoints and, with several threads, what the pool's queue takes.
+//! A pipeline in its steady state, which overwrites a viewpoint with every frame, allocates nothing; with several
+//! threads, what the pool's queue takes.
 
 mod reference;
 
@@ -62,7 +62,7 @@ fn room() -> Scene {
 }
 
 #[test]
-fn a_frame_that_overwrites_allocates_only_the_list_in_its_report() {
+fn a_frame_that_overwrites_allocates_nothing() {
     let scene = room();
     let camera = camera(160, 120);
     let frames: Vec<_> = (0..6)
@@ -76,10 +76,10 @@ fn a_frame_that_overwrites_allocates_only_the_list_in_its_report() {
         })
         .collect();
     for (preset, threads, most) in [
-        (Preset::Paper, 1, 1),
-        (Preset::Robust, 1, 1),
-        (Preset::Paper, 2, 2),
-        (Preset::Robust, 2, 2),
+        (Preset::Paper, 1, 0),
+        (Preset::Robust, 1, 0),
+        (Preset::Paper, 2, 1),
+        (Preset::Robust, 2, 1),
     ] {
         let settings = Settings {
             viewpoints: 4,

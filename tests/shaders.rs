@@ -12,7 +12,7 @@ use surprised::{
         layout::{Estimate, Exposure, Frame, Level, Rules, View},
         passes::{EXPOSE, EXPOSE_PIXELS, HISTOGRAM_WORDS, PASSES, Pass},
     },
-    stages::interpolate::merge::VIEWS_MAX,
+    model::viewpoint::VIEWS_MAX,
 };
 
 /// What every WebGPU device grants.

@@ -1,11 +1,22 @@
 //! Time of the hot path, whole and stage by stage, beside the plain scalar `f64` reference and a read of the same memory.
 //!
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
-//! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a busy
-//! Xeon with AVX-512 (2.6 GHz), 320x240, 7 views, one core, least of 8, processor time: `paper` 7.3 ms (recall 5.8, score
-//! 1.0, prepare 0.2, observe 0.1), with noisy depth 8.5, the reference 152 ms, reading 1.9 ms; `robust` 13.7 ms (refine
-//! 3.0, recall 8.1, score 2.4, prepare 0.6). `peers.py`, least of 50: remap of 70 planes 13.8 ms, MOG2 2.5 ms, NumPy +
-//! SciPy 18.2 ms beside 8.5 ms.
+//! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a Xeon
+//! with AVX-512 (2.6 GHz), least of 4 to 6 repetitions, milliseconds; one thread in time of the processor:
+//!
+//! ```text
+//!                        320x240   noisy  3 views  15 views  2 threads | 640x480   noisy  3 views  15 views  2 threads
+//! paper, 7 views             7.3     8.9      4.2      14.7       4.7  |    28.1    39.0     15.5      61.9      17.4
+//! robust, one view more     12.5    14.7      9.5      22.0       9.9  |    50.7    62.6     36.5      89.8      37.0
+//! reference (of paper)       154     154        -         -         -  |     626     626        -         -         -
+//! reading (of paper)         2.1     2.0      0.8       3.8         -  |     5.6     5.4      2.3      11.3         -
+//! ```
+//!
+//! Of the 7.3: recall 5.8, score 0.8, prepare 0.2, observe 0.1; of the 12.5: refine 3.0, recall 7.1, score 2.2, prepare
+//! 0.4. Recall waits for memory: without its prefetches a frame takes a fifth longer, and on large pages
+//! (`GLIBC_TUNABLES=glibc.malloc.hugetlb=1`) `paper` takes 6.8. `peers.py`, least of 60: at 320x240 `paper` 7.3, `robust`
+//! 12.9, remap of 70 planes 13.2, interleaved 5.1, MOG2 2.3, KNN 4.7, NumPy + SciPy 12.4; at 640x480 27.2, 50.0, 49.5, 17.9,
+//! 9.8, 20.7, 58.6. Refinement is done by one thread. Seven of 1,000,000 viewpoints are selected in 0.006 ms.
 
 #[path = "../../tests/reference/mod.rs"]
 mod reference;
@@ -128,7 +139,7 @@ impl Case {
         }
     }
 
-    /// A whole frame; wall time, milliseconds.
+    /// A whole frame; milliseconds of the processor.
     fn repeat(&mut self) -> f64 {
         let frame = &self.frames[self.next % self.frames.len()];
         self.next += 1;
@@ -136,9 +147,8 @@ impl Case {
         timed(&mut self.stages[0], || {
             self.pipeline.process(frame).expect("a good frame")
         });
-        let wall = start.elapsed().as_secs_f64() * 1e3;
-        self.wall.0.push(wall);
-        wall
+        self.wall.0.push(start.elapsed().as_secs_f64() * 1e3);
+        self.stages[0].0[self.stages[0].0.len() - 1]
     }
 
     fn repeat_stages(&mut self) {
@@ -307,7 +317,7 @@ fn recall_views(pipeline: &Pipeline) -> Vec<RecallView<'_>> {
         .collect()
 }
 
-/// For `peers.py`: one repetition of the whole for each line on stdin, milliseconds on stdout; frames to a file first.
+/// For `peers.py`: one repetition of the whole for each line on stdin, the processor's milliseconds on stdout; frames to a file first.
 fn serve(path: &str, width: usize, height: usize) {
     let world = World::new(width, height);
     let mut cases =
@@ -319,8 +329,7 @@ fn serve(path: &str, width: usize, height: usize) {
     std::fs::write(path, bytes).expect("the frames can be written");
     for line in std::io::stdin().lines() {
         let case = &mut cases[usize::from(line.expect("text") == "robust")];
-        let wall = case.repeat();
-        println!("{wall}");
+        println!("{}", case.repeat());
     }
 }
 

@@ -1,8 +1,9 @@
 //! What the service says about a frame.
 
+use arrayvec::ArrayVec;
 use nalgebra::Point3;
 
-use super::{event::Event, frame::Source, pose::Pose};
+use super::{event::Event, frame::Source, pose::Pose, viewpoint::VIEWS_MAX};
 
 /// Half-open: `x_min <= x < x_max`, pixels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -79,7 +80,7 @@ pub struct Report {
     pub learned: bool,
     /// The viewpoint that the frame became; `None` if it was not learnt.
     pub viewpoint_id: Option<u64>,
-    pub viewpoints_used: Vec<u64>,
+    pub viewpoints_used: ArrayVec<u64, VIEWS_MAX>,
     /// How far refinement moved the given pose.
     pub pose_correction_m: f64,
     pub pose_correction_rad: f64,

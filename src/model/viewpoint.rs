@@ -10,6 +10,9 @@ use super::{
     pose::Pose,
 };
 
+/// Viewpoints that are recalled together, as [`crate::config::Settings::views`] allows.
+pub const VIEWS_MAX: usize = 16;
+
 /// Bits of [`Mesh::cut`]: which of a quad's two triangles exist.
 pub const UPPER_LEFT: u8 = 1;
 pub const LOWER_RIGHT: u8 = 2;

@@ -7,7 +7,7 @@ use arrayvec::ArrayVec;
 
 use crate::{
     model::pose::{Pose, view_distance_m},
-    stages::interpolate::merge::VIEWS_MAX,
+    model::viewpoint::VIEWS_MAX,
 };
 
 /// So many are recalled however far they are: a robot that comes back on another path has no others.

@@ -34,7 +34,7 @@ fn point(world_from_view: &Pose) -> Point {
 pub struct ViewTree {
     nodes: Vec<Node>,
     /// The poses of the leaves, one after the other.
-    poses: Vec<(Pose, usize)>,
+    poses: Vec<(Point, Pose, usize)>,
     /// By index: no longer where the tree thinks.
     moved: Vec<bool>,
     /// Those, and what came later.
@@ -63,12 +63,8 @@ impl ViewTree {
             .collect();
         self.moved.clear();
         self.moved.resize(points.len(), false);
-        let count = points.len();
         self.split(&mut points, 0);
-        self.poses.clear();
-        self.poses.reserve(count);
-        self.poses
-            .extend(points.into_iter().map(|(_, pose, index)| (pose, index)));
+        self.poses = points;
     }
 
     fn split(&mut self, points: &mut [(Point, Pose, usize)], start: usize) {
@@ -142,8 +138,9 @@ impl ViewTree {
     fn visit(&self, node: usize, query: &Query, nearest: &mut Nearest) {
         let at = &self.nodes[node];
         if at.second == 0 {
-            for (pose, index) in &self.poses[at.start..at.end] {
-                if !self.moved[*index] {
+            for (point, pose, index) in &self.poses[at.start..at.end] {
+                // An angle takes several times as long as its chord.
+                if Query::may_hold(query.bound(point, point), nearest) && !self.moved[*index] {
                     let distance_m =
                         view_distance_m(pose, query.world_from_camera, query.metres_per_radian);
                     nearest.offer(distance_m, *index);
@@ -151,13 +148,15 @@ impl ViewTree {
             }
             return;
         }
-        let mut children =
-            [node + 1, at.second].map(|child| (query.bound(&self.nodes[child]), child));
+        let mut children = [node + 1, at.second].map(|child| {
+            let Node { low, high, .. } = &self.nodes[child];
+            (query.bound(low, high), child)
+        });
         if children[1].0 < children[0].0 {
             children.swap(0, 1);
         }
         for (bound, child) in children {
-            if bound * (1.0 - ROUNDING) - ROUNDING <= nearest.farthest_m() {
+            if Query::may_hold(bound, nearest) {
                 self.visit(child, query, nearest);
             }
         }
@@ -171,11 +170,16 @@ struct Query<'a> {
 }
 
 impl Query<'_> {
-    /// No pose in the node is nearer.
-    fn bound(&self, node: &Node) -> f64 {
+    /// Whether a pose that is no nearer than this may still be among the nearest.
+    fn may_hold(bound: f64, nearest: &Nearest) -> bool {
+        bound * (1.0 - ROUNDING) - ROUNDING <= nearest.farthest_m()
+    }
+
+    /// No pose between these corners is nearer.
+    fn bound(&self, low: &Point, high: &Point) -> f64 {
         let outside = |axis: usize| {
             let at = self.point[axis];
-            (node.low[axis] - at).max(at - node.high[axis]).max(0.0)
+            (low[axis] - at).max(at - high[axis]).max(0.0)
         };
         let norm = |axes: [usize; 3]| {
             axes.into_iter()

@@ -273,7 +273,7 @@ pub fn report(report: &Report, place: &str, processing_seconds: f64) -> proto::S
         coverage: report.coverage,
         learned: report.learned,
         viewpoint_id: report.viewpoint_id.unwrap_or(0),
-        viewpoints_used: report.viewpoints_used.clone(),
+        viewpoints_used: report.viewpoints_used.to_vec(),
         processing_seconds,
         pose_correction_m: report.pose_correction_m,
         pose_correction_rad: report.pose_correction_rad,
@@ -441,7 +441,7 @@ impl PriorPlanes {
         let prior = &at.prior;
         let mut picked = Self {
             reply: proto::PriorReply {
-                viewpoints_used: at.viewpoints_used.clone(),
+                viewpoints_used: at.viewpoints_used.to_vec(),
                 covered: covered(prior),
                 ..proto::PriorReply::default()
             },

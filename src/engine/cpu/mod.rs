@@ -17,12 +17,12 @@ use crate::{
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint},
     },
     stages::{
         exposure::exposure_gain_on,
         interpolate::{
-            merge::{MergeRules, MergeView, VIEWS_MAX},
+            merge::{MergeRules, MergeView},
             prior::{self, Prior, PriorRow},
             project::{Projector, Reach},
         },
@@ -34,8 +34,9 @@ use crate::{
 use score::{ScoreRules, ScoreScratch};
 use strips::StripScratch;
 
-/// Rows of a strip: its maps of seven views of 640 pixels stay within 900 KB, a core's second-level cache.
-const STRIP_ROWS: usize = 24;
+/// Rows of a strip: its maps of seven views of 640 pixels stay within 450 KB, beside the records that they lead to, in a
+/// core's second-level cache.
+const STRIP_ROWS: usize = 12;
 
 /// A viewpoint to recall from.
 #[derive(Clone, Copy)]

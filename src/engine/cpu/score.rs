@@ -96,6 +96,10 @@ fn score_row_kernel<T: Transpose>(
     }
     for start in (0..width).step_by(LANES) {
         let count = LANES.min(width - start);
+        for record in (0..LANES).step_by(2) {
+            // The next row's, two a line of cache: they are written whole, but lines are fetched first.
+            prefetch(posterior, width + start + record);
+        }
         let mut step = Step::load(row, observed, inverse_gain, start, count);
         let mut scored = if widened {
             for (channel, gradient) in scratch.edge_gradient.iter().enumerate() {

@@ -2,9 +2,10 @@
 
 use crate::{
     isa::{Isa, for_each_isa},
+    model::viewpoint::VIEWS_MAX,
     stages::interpolate::{
         gather::Portable,
-        merge::{MergeRules, MergeView, VIEWS_MAX, merge_row},
+        merge::{MergeRules, MergeView, merge_row},
         prior::PLANES,
         project::{ProjectScratch, Projector, Sample, draw, map_size},
     },

@@ -10,8 +10,8 @@ use super::{
     passes::{HISTOGRAM_WORDS, PASSES, REFINE_PIXELS, REFINE_THREADS, SUMS, Slot},
 };
 use crate::{
-    model::belief::Record,
-    stages::{interpolate::merge::VIEWS_MAX, refine::LEVELS_MAX},
+    model::{belief::Record, viewpoint::VIEWS_MAX},
+    stages::refine::LEVELS_MAX,
 };
 
 pub const DEPTH_BYTES: u64 = size_of::<f32>() as u64;

@@ -80,18 +80,6 @@ impl Source {
         }
     }
 
-    /// Asks for what the row below will need: of its three records two are near those of this row.
-    #[inline(always)]
-    pub fn prefetch_below(&self, view: &GatherView) {
-        // Two records are one line of cache.
-        for lane in (0..LANES).step_by(2) {
-            prefetch(
-                view.records,
-                self.upper_left[lane] as usize + 2 * view.width,
-            );
-        }
-    }
-
     /// The three records of a lane, in the order of the weights.
     #[inline(always)]
     pub fn records<'a>(&self, lane: usize, view: &GatherView<'a>) -> [&'a Record; 3] {
@@ -110,6 +98,13 @@ pub struct GatherView<'a> {
     pub records: &'a [Record],
     pub width: usize,
     pub weight: f32,
+}
+
+/// Asks for what the row below will need: of its three records two are near those of this row. One at a time, between
+/// other work: only so many may be on their way at once, and who asks for one more waits.
+#[inline(always)]
+fn prefetch_below(view: &GatherView, upper_left: usize) {
+    prefetch(view.records, upper_left + 2 * view.width);
 }
 
 /// Sums of sixteen pixels over views, as planes.
@@ -180,6 +175,7 @@ impl Gather for Portable {
             for index in members(seen[lane]) {
                 let source = &sources[index];
                 let records = source.records(lane, &views[index]);
+                prefetch_below(&views[index], source.upper_left[lane] as usize);
                 let weight = views[index].weight;
                 for (record, weights) in records.into_iter().zip(&source.weights) {
                     let w = weights[lane] * weight;
@@ -241,7 +237,7 @@ mod x86 {
 
     use crate::lanes::members;
 
-    use super::{Gather, GatherView, LANES, Source, Sums, Tile, planes};
+    use super::{Gather, GatherView, LANES, Source, Sums, Tile, planes, prefetch_below};
 
     /// With AVX2 and F16C.
     pub struct Avx;
@@ -291,6 +287,7 @@ mod x86 {
                 let halves = unsafe {
                     let upper_left = view.records.as_ptr().add(source.upper_left[lane] as usize);
                     let corner = view.records.as_ptr().add(source.corner[lane] as usize);
+                    prefetch_below(view, source.upper_left[lane] as usize);
                     [corner, upper_left.add(1), upper_left.add(view.width)].map(|record| {
                         (
                             _mm_load_si128(record.cast()),

@@ -7,7 +7,10 @@
 
 use crate::{
     lanes::{LANES, Lanes, bits, members, prefetch, reciprocal},
-    model::belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
+    model::{
+        belief::{Belief, CHANNELS, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
+        viewpoint::VIEWS_MAX,
+    },
 };
 
 use super::{
@@ -15,9 +18,6 @@ use super::{
     prior,
     project::Sample,
 };
-
-/// As [`crate::config::Settings::views`] allows.
-pub const VIEWS_MAX: usize = 16;
 
 /// Channels together must differ by more than this, grey levels, before views vote on colour: below it the mean is as
 /// good, and cheaper.
@@ -160,7 +160,6 @@ pub fn merge_row<G: Gather>(
                 if rules.depth_vote_tolerance.is_some() {
                     step.range(&source.inverse_depth);
                 }
-                source.prefetch_below(&gather_views[index]);
             }
         }
         let mut apart = 0;

@@ -31,14 +31,12 @@ pub enum Drawable {
     Hidden,
     /// As it passes the camera plane or is seen edge on.
     ByTriangles,
-    Flat(FlatPatch),
+    /// With the first and the last row of the target that it can touch.
+    Flat(FlatPatch, (f32, f32)),
 }
 
 /// A patch ready to be drawn.
 pub struct FlatPatch {
-    /// Rows of the target that it can touch.
-    pub low: f32,
-    pub high: f32,
     /// From `(x, y, 1)` to column and row within the patch and the divisor of both.
     source: Matrix3<f64>,
     /// From `(x, y, 1)` to 1/depth in the target.
@@ -121,9 +119,7 @@ impl FlatPatch {
                 high = high.min(-border.z / border.y);
             }
         }
-        Drawable::Flat(Self {
-            low: low as f32,
-            high: high as f32,
+        let flat = Self {
             inverse_depth: plane * source,
             columns: columns as f32,
             rows: rows as f32,
@@ -132,7 +128,8 @@ impl FlatPatch {
             lefts,
             rights,
             source,
-        })
+        };
+        Drawable::Flat(flat, (low as f32, high as f32))
     }
 
     /// The pixels of row `y` that it covers, `first..end`.
@@ -175,10 +172,10 @@ impl FlatPatch {
                 .try_into()
                 .expect("sixteen are sixteen");
             let count = end - at;
-            let ahead = (at - first) as f32;
+            let along = (at - first) as f32;
             let (mut highs, mut lows) = ([0u32; LANES], [0u32; LANES]);
             for lane in 0..LANES {
-                let x = ahead + lane as f32;
+                let x = along + lane as f32;
                 let divisor = slopes[2] * x + starts[2];
                 let r = reciprocal(divisor);
                 let r = r * (2.0 - divisor * r);

@@ -105,8 +105,10 @@ pub struct Reach {
     high: Vec<f32>,
     /// Of each row's blocks together.
     rows: Vec<(f32, f32)>,
-    /// The patches that are drawn as such.
+    /// The patches that are drawn as such, and apart from them, so that many are passed over quickly, the target rows
+    /// that each can touch.
     flat: Vec<FlatPatch>,
+    flat_rows: Vec<(f32, f32)>,
     /// Blocks of [`PATCH_ROWS`] rows that need no triangles.
     done: Vec<bool>,
 }
@@ -153,6 +155,8 @@ impl Reach {
         let blocks = mesh.blocks();
         self.flat.clear();
         self.flat.reserve(mesh.patches.capacity());
+        self.flat_rows.clear();
+        self.flat_rows.reserve(mesh.patches.capacity());
         self.done.clear();
         self.done
             .resize(blocks * mesh.intrinsics.height.div_ceil(PATCH_ROWS), false);
@@ -160,7 +164,10 @@ impl Reach {
             match FlatPatch::of(patch, &mesh.intrinsics, h_matrix, h_offset) {
                 Drawable::ByTriangles => continue,
                 Drawable::Hidden => {}
-                Drawable::Flat(flat) => self.flat.push(flat),
+                Drawable::Flat(flat, rows) => {
+                    self.flat.push(flat);
+                    self.flat_rows.push(rows);
+                }
             }
             let first = patch.row / PATCH_ROWS * blocks + patch.column / LANES;
             self.done[first..first + patch.columns.div_ceil(LANES)].fill(true);
@@ -272,13 +279,14 @@ impl<'a> Projector<'a> {
     ) {
         let pixels = width * strip.len();
         assert_eq!(map.len(), map_size(pixels), "the map is the strip");
-        for flat in &self.reach.flat {
+        for (flat, (low, high)) in self.reach.flat.iter().zip(&self.reach.flat_rows) {
             // As floats, because both may lie far outside.
-            let first = flat.low.max(strip.start as f32).ceil();
-            let last = flat.high.min(strip.end as f32 - 1.0);
+            let first = low.max(strip.start as f32).ceil();
+            let last = high.min(strip.end as f32 - 1.0);
             if first <= last {
                 for y in first as usize..=last as usize {
-                    flat.draw_row(y, width, &mut map[(y - strip.start) * width..]);
+                    let map = &mut map[(y - strip.start) * width..];
+                    flat.draw_row(y, width, map);
                 }
             }
         }
@@ -304,13 +312,13 @@ impl<'a> Projector<'a> {
             if held.0 == row && held.1.start <= touched.start && touched.end <= held.1.end {
                 std::mem::swap(&mut scratch.upper, &mut scratch.lower);
             } else {
-                self.transform(row, touched.clone(), &mut scratch.upper);
+                self.transform_needed(row, row, touched.clone(), &mut scratch.upper);
             }
             let mut both = touched.clone();
             if !below.is_empty() {
                 both = both.start.min(below.start)..both.end.max(below.end);
             }
-            self.transform(row + 1, both.clone(), &mut scratch.lower);
+            self.transform_needed(row, row + 1, both.clone(), &mut scratch.lower);
             held = (row + 1, both);
             next = Some(below);
             let cut = &self.mesh.cut[row * (columns - 1)..][..columns - 1];
@@ -350,8 +358,16 @@ impl<'a> Projector<'a> {
         first * LANES..end * LANES
     }
 
+    /// Vertices of `row`, of what was touched, as far as the quads above and below it are drawn by triangles; the quads
+    /// above are those of row `above`, and where they are the same, only these count.
     #[inline(always)]
-    fn transform(&self, row: usize, touched: Range<usize>, vertices: &mut VertexRow) {
+    fn transform_needed(
+        &self,
+        above: usize,
+        row: usize,
+        touched: Range<usize>,
+        vertices: &mut VertexRow,
+    ) {
         let columns = self.mesh.intrinsics.width;
         // A block of quads reads one vertex beyond its last.
         let padded = columns.next_multiple_of(LANES) + 1;
@@ -362,6 +378,28 @@ impl<'a> Projector<'a> {
         ] {
             plane.resize(padded, 0.0);
         }
+        let blocks = self.mesh.blocks();
+        let below = row.min(self.reach.rows.len() - 1);
+        let above = &self.reach.low[above * blocks..][..blocks];
+        let below = &self.reach.low[below * blocks..][..blocks];
+        let end = touched.end / LANES;
+        let mut block = touched.start / LANES;
+        while block < end {
+            let is_needed = |block: usize| min(above[block], below[block]) < f32::INFINITY;
+            let first = block;
+            while block < end && is_needed(block) {
+                block += 1;
+            }
+            if first < block {
+                self.transform(row, first * LANES..block * LANES, vertices);
+            }
+            block += 1;
+        }
+    }
+
+    #[inline(always)]
+    fn transform(&self, row: usize, touched: Range<usize>, vertices: &mut VertexRow) {
+        let columns = self.mesh.intrinsics.width;
         let m = self.h_matrix.cast::<f32>();
         let start = (self.h_matrix * Vector3::new(0.0, row as f64, 1.0)).cast::<f32>();
         let offset = self.h_offset.cast::<f32>();
