@@ -12,9 +12,12 @@ use crate::{
 
 /// So many are recalled however far they are: a robot that comes back on another path has no others.
 const NEAREST_KEPT: usize = 3;
+/// But a robot that comes where another one looked from afar, and has seen little itself so far, is better off with its
+/// own two views: what the far one saw from aside surprises along every edge. Ten to thirty do the same.
+const FAR_RATIO: f64 = 16.0;
 
 /// The `count` poses nearest to `world_from_camera`, nearest first, ties to the earlier index; of those beyond
-/// `distance_max_m` only the nearest three.
+/// `distance_max_m` only the nearest three, and none that is sixteen times as far as the nearest.
 pub fn select_nearest<'a>(
     world_from_views: impl Iterator<Item = &'a Pose>,
     world_from_camera: &Pose,
@@ -87,17 +90,18 @@ impl Nearest {
         self.held.insert(rank, (distance_m, index));
     }
 
-    /// Their indices; of those beyond `distance_max_m` only the nearest three.
+    /// Their indices; of those beyond `distance_max_m` only the nearest three, and none that is [`FAR_RATIO`] times as
+    /// far as the nearest.
     pub fn within(self, distance_max_m: f64, selected: &mut Vec<usize>) {
+        let nearest_m = self.held.first().map_or(0.0, |held| held.0);
+        let far_m = distance_max_m.max(FAR_RATIO * nearest_m);
+        let near = self.closer_than(distance_max_m);
+        let kept = near.max(self.closer_than(far_m).min(NEAREST_KEPT));
         selected.clear();
-        selected.extend(
-            self.held
-                .into_iter()
-                .enumerate()
-                .filter(|(rank, (distance_m, _))| {
-                    *rank < NEAREST_KEPT || *distance_m <= distance_max_m
-                })
-                .map(|(_, (_, index))| index),
-        );
+        selected.extend(self.held.into_iter().take(kept).map(|(_, index)| index));
+    }
+
+    fn closer_than(&self, distance_m: f64) -> usize {
+        self.held.partition_point(|held| held.0 <= distance_m)
     }
 }
