@@ -203,7 +203,7 @@ fn views_beyond_the_limit_are_left_out_but_for_the_nearest_three() {
 #[test]
 fn far_views_are_left_out_where_there_is_one_much_nearer() {
     let at = |x: f64| pose([x, 0.0, 0.0], [0.0; 3]);
-    for (x, kept) in [(0.05, vec![0]), (0.07, vec![0, 1, 2])] {
+    for (x, kept) in [(0.03, vec![0]), (0.04, vec![0, 1, 2])] {
         let views: Vec<Pose> = [x, 1.0, 1.1].map(at).into();
         assert_eq!(
             select_nearest(views.iter(), &at(0.0), 1.0, 7, 0.16),
