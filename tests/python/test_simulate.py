@@ -1,6 +1,7 @@
 """Simulated robots are on the network like real ones: frames, calibration and a token, and the truth beside them."""
 
 import json
+import re
 import subprocess
 import threading
 from collections import defaultdict
@@ -89,4 +90,5 @@ def test_without_a_service_nothing_is_sent_and_the_error_says_so(daemon):
         timeout=120,
     )
     assert done.returncode == 1
-    assert "nobody takes frames at elsewhere/kitchen/robot0/front/frame" in done.stderr
+    # Which of the two says it first is chance.
+    assert re.search(r"nobody takes frames at elsewhere/kitchen/robot[01]/front/frame", done.stderr), done.stderr
