@@ -4,9 +4,9 @@ Needs: pip install eclipse-zenoh==1.10.2 grpcio-tools numpy pillow; `cargo build
 as `python benches/query_latency.py [BINARY [SECONDS]]`. One asker asks one kind of question after another, each as soon
 as the last was answered; then eight askers ask for priors at once. Everything goes over Zenoh on loopback.
 
-On two cores of a shared Xeon, 320x240, three seconds each, milliseconds (p50/p99): prior 10/27, with every plane 31/51,
-evaluate 16/37, views 0.3/2.1, status 0.2/2.8, next_view of 8 94/132, of 64 884/908 (four were asked), forget where nothing is
-6/28, eight askers for priors 86/120. Frames from sending to report: 18/29 while nobody asks, 15..31/30..73 meanwhile.
+On two quiet cores of a Xeon, 320x240, milliseconds (p50/p99): prior 9/27, with every plane 26/48, evaluate 13/31, views
+0.3/1.0, status 0.2/2.4, next_view of 8 107/146, of 64 995/1031 (eight were asked), forget where nothing is 6/23, eight askers
+for priors 88/127. Frames from sending to report: 16/20 while nobody asks, 14..26/27..71 meanwhile.
 
 The same two cores while others kept twelve processes busy on them, so that the robots alone are more than they can do: prior
 300/460, with every plane 700/727, evaluate 594/654, views 416/473, status 2.8/24, next_view of 8 4704 (one was asked), of 64
