@@ -6,7 +6,7 @@ frames a second, the first half without learning (every frame recalls what is st
 cache is dropped before where the user may.
 
 10,000 viewpoints of 320x240 (8.6 GB on disk), two cores of a shared Xeon that others kept busy (load 7): known 1.2 s after the
-start; observing, 200 frames: hit rate 0.985 (the first three waited, 151 ms in all), frames p50/p99 94/185 ms; learning, 190
+start; observing, 200 frames: hit rate 0.985 (three waited, 151 ms in all), frames p50/p99 94/185 ms; learning, 190
 frames: hit rate 0.995 (one waited, not a millisecond), 82/341 ms, nothing late. With a budget of 256 MiB the viewpoints took
 254 and the whole process at most 440 MiB. Before blocks of their size went back to the system it took 1029 MiB, and rising.
 """
