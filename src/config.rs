@@ -72,8 +72,9 @@ pub struct Settings {
     /// How many nearest viewpoints are recalled (section III-D: seven). At most 16: votes are bit masks and the
     /// work grows with it.
     pub views: usize,
-    /// Views farther than this, metres of view distance, are left out beyond the three nearest: where viewpoints are
-    /// sparse the seventh sees another side of things, and edges flash. 1e6 = no limit, as in the paper.
+    /// Views farther than this, metres of view distance, are left out beyond the three nearest, and also among these where
+    /// one is thirty times nearer: where viewpoints are sparse the seventh sees another side of things, and edges flash.
+    /// 1e6 = no limit, as in the paper.
     pub view_distance_max_m: f64,
     /// Metres of view distance that one radian between viewing directions counts for. Insensitive from 0.3 to 3.
     pub metres_per_radian: f64,
