@@ -141,8 +141,8 @@ impl Pipeline {
         Self {
             sides_depth: SidesDepth::new(depth_range(&settings), isa),
             engine,
+            refiner: PoseRefiner::new(pool.clone(), isa),
             pool,
-            refiner: PoseRefiner::new(isa),
             update_rules: UpdateRules::new(&settings),
             memory: Memory::default(),
             spares: ArrayVec::new(),

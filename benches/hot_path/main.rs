@@ -121,7 +121,7 @@ impl Case {
         let (width, height) = (camera.width, camera.height);
         Self {
             name: format!("{width}x{height} {preset:?} {views} views {threads} thr{noise}"),
-            refiner: PoseRefiner::new(isa()),
+            refiner: PoseRefiner::new(reference::pool(threads), isa()),
             work: Stages {
                 engine: CpuEngine::new(pipeline.settings(), reference::pool(threads), isa()),
                 observation: Observation::default(),

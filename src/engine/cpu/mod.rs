@@ -390,20 +390,34 @@ impl<'a> Recall<'a> {
         world_from_camera: &Pose,
         reaches: &'a mut [Reach; VIEWS_MAX],
     ) -> Self {
+        let aim = |(view, reach): (&RecallView, &mut Reach)| {
+            let Viewpoint {
+                mesh,
+                world_from_camera: world_from_view,
+                ..
+            } = view.viewpoint;
+            reach.aim(
+                engine.isa,
+                mesh,
+                world_from_view,
+                intrinsics,
+                world_from_camera,
+            );
+        };
+        if engine.is_alone() {
+            views.iter().zip(&mut *reaches).for_each(aim);
+        } else {
+            engine.pool.install(|| {
+                let both = views.par_iter().zip(&mut *reaches);
+                both.with_max_len(1).for_each(aim);
+            });
+        }
         Self {
             engine,
             projectors: views
                 .iter()
-                .zip(reaches)
-                .map(|(view, reach)| {
-                    Projector::new(
-                        &view.viewpoint.mesh,
-                        &view.viewpoint.world_from_camera,
-                        intrinsics,
-                        world_from_camera,
-                        reach,
-                    )
-                })
+                .zip(&*reaches)
+                .map(|(view, reach)| Projector::new(&view.viewpoint.mesh, reach))
                 .collect(),
             views: views
                 .iter()

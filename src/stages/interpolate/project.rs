@@ -7,7 +7,7 @@ use std::ops::Range;
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::isa::for_each_isa;
+use crate::isa::{Isa, for_each_isa};
 use crate::lanes::{LANES, Lanes, reciprocal};
 use crate::model::{
     camera::Intrinsics,
@@ -92,15 +92,15 @@ pub fn sample_position(sample: Sample) -> (usize, usize, f32, f32) {
 /// homogeneous target pixels.
 pub struct Projector<'a> {
     mesh: &'a Mesh,
-    h_matrix: Matrix3<f64>,
-    h_offset: Vector3<f64>,
     reach: &'a Reach,
 }
 
-/// Which target rows the quads of a mesh can reach: least and greatest y, a block of sixteen quads each. Blocks without
-/// any have `(inf, -inf)`.
+/// Where a mesh lands, and which target rows its quads can reach: least and greatest y, a block of sixteen quads each.
+/// Blocks without any have `(inf, -inf)`.
 #[derive(Default)]
 pub struct Reach {
+    h_matrix: Matrix3<f64>,
+    h_offset: Vector3<f64>,
     low: Vec<f32>,
     high: Vec<f32>,
     /// Of each row's blocks together.
@@ -150,7 +150,22 @@ pub fn homography(
 }
 
 impl Reach {
+    /// For a mesh and a camera; memory that is there is used again.
+    pub fn aim(
+        &mut self,
+        isa: Isa,
+        mesh: &Mesh,
+        world_from_view: &Pose,
+        target: &Intrinsics,
+        world_from_target: &Pose,
+    ) {
+        let (h_matrix, h_offset) = homography(mesh, world_from_view, target, world_from_target);
+        (self.h_matrix, self.h_offset) = (h_matrix, h_offset);
+        reach(isa, self, mesh, &h_matrix, &h_offset);
+    }
+
     /// Finds which patches are drawn as such.
+    #[inline(always)]
     fn flatten(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
         let blocks = mesh.blocks();
         self.flat.clear();
@@ -175,6 +190,7 @@ impl Reach {
     }
 
     /// Target y is monotonous in column and in depth, so the corners of a block's ranges bound it.
+    #[inline(always)]
     fn compute(&mut self, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
         let Intrinsics { width, height, .. } = mesh.intrinsics;
         let blocks = mesh.blocks();
@@ -248,23 +264,9 @@ impl Reach {
 }
 
 impl<'a> Projector<'a> {
-    /// `reach` is working memory.
-    pub fn new(
-        mesh: &'a Mesh,
-        world_from_view: &Pose,
-        target: &Intrinsics,
-        world_from_target: &Pose,
-        reach: &'a mut Reach,
-    ) -> Self {
-        let (h_matrix, h_offset) = homography(mesh, world_from_view, target, world_from_target);
-        reach.flatten(mesh, &h_matrix, &h_offset);
-        reach.compute(mesh, &h_matrix, &h_offset);
-        Self {
-            mesh,
-            h_matrix,
-            h_offset,
-            reach,
-        }
+    /// `reach` was aimed with this mesh.
+    pub fn new(mesh: &'a Mesh, reach: &'a Reach) -> Self {
+        Self { mesh, reach }
     }
 
     /// Draws what falls into rows `strip` of the target. `map` is that strip, as large as [`map_size`] says, and keeps
@@ -400,9 +402,9 @@ impl<'a> Projector<'a> {
     #[inline(always)]
     fn transform(&self, row: usize, touched: Range<usize>, vertices: &mut VertexRow) {
         let columns = self.mesh.intrinsics.width;
-        let m = self.h_matrix.cast::<f32>();
-        let start = (self.h_matrix * Vector3::new(0.0, row as f64, 1.0)).cast::<f32>();
-        let offset = self.h_offset.cast::<f32>();
+        let m = self.reach.h_matrix.cast::<f32>();
+        let start = (self.reach.h_matrix * Vector3::new(0.0, row as f64, 1.0)).cast::<f32>();
+        let offset = self.reach.h_offset.cast::<f32>();
         // Quads need the vertex to their right.
         let touched = touched.start..(touched.end + 1).min(columns);
         let depth_m = &self.mesh.depth_m[row * columns..][touched.clone()];
@@ -423,6 +425,21 @@ impl<'a> Projector<'a> {
             inverse_depths[column] = inverse;
         }
     }
+}
+
+for_each_isa! {
+    fn reach(
+        reach: &mut Reach,
+        mesh: &Mesh,
+        h_matrix: &Matrix3<f64>,
+        h_offset: &Vector3<f64>,
+    ) = reach_kernel;
+}
+
+#[inline(always)]
+fn reach_kernel(reach: &mut Reach, mesh: &Mesh, h_matrix: &Matrix3<f64>, h_offset: &Vector3<f64>) {
+    reach.flatten(mesh, h_matrix, h_offset);
+    reach.compute(mesh, h_matrix, h_offset);
 }
 
 for_each_isa! {

@@ -1,0 +1,460 @@
+//! The pixels of some rows of a level: what a step of refinement needs to know about them.
+//!
+//! A level's planes and an estimate -> residuals in predicted standard deviations, their histogram, their weighted normal
+//! equations. Which rows are one band depends on the level alone, and sums of bands are added in their order, so that
+//! the number of threads changes no bit.
+
+use std::ops::Range;
+
+use crate::{
+    isa::{Isa, for_each_isa},
+    lanes::{LANES, Lanes, bits, members},
+    model::camera::Intrinsics,
+};
+
+use super::level::{Level, PredictScratch};
+
+/// Variance of the sensor on top of what the belief predicts, squared grey levels.
+const SENSOR_VARIANCE: f32 = 9.0;
+/// Where a residual stops counting in the test whether refinement helped, predicted standard deviations.
+const RESIDUAL_CAP: f32 = 4.0;
+/// Pixels of a band, about: some ten microseconds of work.
+const BAND_PIXELS: usize = 2560;
+/// Products of two of eight derivatives.
+pub const HESSIAN: usize = 36;
+/// The upper triangle of the normal equations row by row, then the gradient.
+pub type NormalSums = [f64; HESSIAN + 8];
+/// Steps of sixteen pixels that are added up in single precision.
+const STEPS_MAX: usize = 64;
+
+/// Bins of a histogram over magnitudes: eight to an octave.
+const BINS: usize = 1 << (31 - BIN_SHIFT);
+const BIN_SHIFT: u32 = 20;
+/// Where NaN falls, which is no magnitude.
+const NAN_BIN: usize = (f32::NAN.to_bits() >> BIN_SHIFT) as usize;
+
+/// A level as a camera sees it.
+pub struct LevelView<'a> {
+    pub level: &'a Level,
+    pub camera: &'a Intrinsics,
+    /// Right per unit of depth, a value a column, padded to whole steps.
+    pub along: &'a [f32],
+}
+
+impl LevelView<'_> {
+    /// Steps of a row.
+    #[inline(always)]
+    fn steps(&self) -> usize {
+        self.along.len() / LANES
+    }
+}
+
+/// How the points are seen by an estimate.
+pub struct Motion {
+    /// Column by column.
+    pub rotation: [[f32; 3]; 3],
+    pub translation: [f32; 3],
+    pub gain: f32,
+    pub offset: f32,
+}
+
+/// Tukey's weights, predicted standard deviations.
+#[derive(Clone, Copy)]
+pub struct Tukey {
+    pub scale: f32,
+    pub cutoff: f32,
+}
+
+/// Everything about the pixels that does not change while the pose does, a plane a value. Rows are padded to whole
+/// steps.
+#[derive(Default)]
+struct Points {
+    /// Metres; negative where there is nothing to compare.
+    depth_m: Vec<f32>,
+    luminance: Vec<f32>,
+    /// d luminance / d direction: gradient times focal length.
+    slope_x: Vec<f32>,
+    slope_y: Vec<f32>,
+    inverse_sd: Vec<f32>,
+}
+
+pub struct Band {
+    pub rows: Range<usize>,
+    pub predict: PredictScratch,
+    points: Points,
+    /// What the middle is sought of; NaN does not count. In comparisons residuals, predicted standard deviations.
+    values: Vec<f32>,
+    histogram: Vec<u32>,
+    /// The values of the bin that the middle falls into.
+    members: Vec<f32>,
+    sums: NormalSums,
+}
+
+impl Default for Band {
+    fn default() -> Self {
+        Self {
+            rows: 0..0,
+            predict: PredictScratch::default(),
+            points: Points::default(),
+            values: Vec::new(),
+            histogram: Vec::new(),
+            members: Vec::new(),
+            sums: [0.0; HESSIAN + 8],
+        }
+    }
+}
+
+/// Rows that make a band of an image so wide.
+pub fn band_rows(width: usize) -> usize {
+    (BAND_PIXELS / width.max(1)).max(1)
+}
+
+/// Bands for so many rows; those that are there are used again.
+pub fn divide(bands: &mut Vec<Band>, width: usize, height: usize) -> &mut [Band] {
+    let rows = band_rows(width);
+    let count = height.div_ceil(rows);
+    if bands.len() < count {
+        bands.resize_with(count, Band::default);
+    }
+    for (index, band) in bands[..count].iter_mut().enumerate() {
+        band.rows = index * rows..((index + 1) * rows).min(height);
+    }
+    &mut bands[..count]
+}
+
+impl Band {
+    /// Seeks the middle of depths, 0 = none.
+    pub fn hold_depths(&mut self, isa: Isa, depth_m: &[f32]) {
+        self.values.clear();
+        let given = |z: &f32| if *z > 0.0 { *z } else { f32::NAN };
+        self.values.extend(depth_m.iter().map(given));
+        count(isa, self);
+    }
+
+    /// Collects the comparable pixels: predicted together with their four neighbours.
+    pub fn collect(&mut self, isa: Isa, view: &LevelView) -> usize {
+        let mut comparable = 0;
+        collect(isa, self, view, &mut comparable);
+        comparable
+    }
+
+    /// Residuals of all points, Y(pi(M X)) - gain * tau - offset, NaN where they leave the image.
+    pub fn compare(&mut self, isa: Isa, view: &LevelView, motion: &Motion) {
+        compare(isa, self, view, motion);
+        count(isa, self);
+    }
+
+    /// Adds up the weighted normal equations.
+    pub fn accumulate(&mut self, isa: Isa, view: &LevelView, gain: f32, tukey: Tukey) {
+        accumulate(isa, self, view, gain, tukey);
+    }
+
+    pub fn sums(&self) -> &NormalSums {
+        &self.sums
+    }
+
+    /// Sum of the capped residuals' magnitudes.
+    pub fn mismatch(&self) -> f64 {
+        let counted = self.values.iter().filter(|value| !value.is_nan());
+        counted
+            .map(|value| f64::from(value.abs().min(RESIDUAL_CAP)))
+            .sum()
+    }
+
+    /// Keeps the values of one bin apart.
+    pub fn pick(&mut self, isa: Isa, bin: usize) {
+        pick(isa, self, bin);
+    }
+
+    pub fn members(&self) -> &[f32] {
+        &self.members
+    }
+}
+
+/// How many values all bands hold, and the bin and the rank in it of the middle magnitude.
+pub fn middle_bin(bands: &[Band]) -> (usize, Option<(usize, usize)>) {
+    let mut histogram = [0u32; BINS];
+    for band in bands {
+        for (sum, members) in histogram.iter_mut().zip(&band.histogram) {
+            *sum += members;
+        }
+    }
+    histogram[NAN_BIN] = 0;
+    let count = histogram.iter().sum::<u32>() as usize;
+    let mut rank = count / 2;
+    for (bin, &members) in histogram.iter().enumerate() {
+        let members = members as usize;
+        if rank < members {
+            return (count, Some((bin, rank)));
+        }
+        rank -= members;
+    }
+    (count, None)
+}
+
+#[inline(always)]
+fn bin(value: f32) -> usize {
+    (value.to_bits() >> BIN_SHIFT) as usize % BINS
+}
+
+for_each_isa! {
+    fn count(band: &mut Band) = count_kernel;
+}
+
+#[inline(always)]
+fn count_kernel(band: &mut Band) {
+    band.histogram.clear();
+    band.histogram.resize(BINS, 0);
+    // As many as there can be, so that no frame allocates.
+    band.members.clear();
+    band.members.reserve(band.values.len());
+    let Some(histogram) = band.histogram.first_chunk_mut::<BINS>() else {
+        return;
+    };
+    for &value in &band.values {
+        histogram[bin(value)] += 1;
+    }
+}
+
+for_each_isa! {
+    fn pick(band: &mut Band, wanted: usize) = pick_kernel;
+}
+
+#[inline(always)]
+fn pick_kernel(band: &mut Band, wanted: usize) {
+    let (steps, rest) = band.values.as_chunks::<LANES>();
+    for step in steps {
+        for lane in members(bits(|lane| bin(step[lane]) == wanted)) {
+            band.members.push(step[lane].abs());
+        }
+    }
+    let rest = rest.iter().filter(|value| bin(**value) == wanted);
+    band.members.extend(rest.map(|value| value.abs()));
+}
+
+for_each_isa! {
+    fn collect(band: &mut Band, view: &LevelView<'_>, comparable: &mut usize) = collect_kernel;
+}
+
+#[inline(always)]
+fn collect_kernel(band: &mut Band, view: &LevelView, comparable: &mut usize) {
+    let LevelView { level, camera, .. } = view;
+    let (width, stride) = (level.width, view.along.len());
+    let points = &mut band.points;
+    let size = stride * band.rows.len();
+    for plane in [
+        &mut points.luminance,
+        &mut points.slope_x,
+        &mut points.slope_y,
+        &mut points.inverse_sd,
+    ] {
+        plane.resize(size, 0.0);
+    }
+    points.depth_m.clear();
+    points.depth_m.resize(size, -1.0);
+    let (fx, fy) = (0.5 * camera.fx as f32, 0.5 * camera.fy as f32);
+    let inner = width - 2;
+    for (row, y) in band.rows.clone().enumerate() {
+        if y == 0 || y + 1 == level.height {
+            continue;
+        }
+        let depths = around(&level.depth_m, width, inner, y);
+        let [tau, left, right, above, below] = around(&level.luminance, width, inner, y);
+        let variance = &level.variance[y * width + 1..][..inner];
+        let at = row * stride + 1..row * stride + 1 + inner;
+        let depth_m = &mut points.depth_m[at.clone()];
+        let luminance = &mut points.luminance[at.clone()];
+        let slope_x = &mut points.slope_x[at.clone()];
+        let slope_y = &mut points.slope_y[at.clone()];
+        let inverse_sd = &mut points.inverse_sd[at];
+        let mut found = 0u32;
+        for x in 0..inner {
+            let mut predicted = true;
+            for depths in &depths {
+                predicted &= depths[x] > 0.0;
+            }
+            depth_m[x] = if predicted { depths[0][x] } else { -1.0 };
+            found += u32::from(predicted);
+            luminance[x] = tau[x];
+            slope_x[x] = (right[x] - left[x]) * fx;
+            slope_y[x] = (below[x] - above[x]) * fy;
+            inverse_sd[x] = 1.0 / (variance[x] + SENSOR_VARIANCE).sqrt();
+        }
+        *comparable += found as usize;
+    }
+}
+
+/// So many pixels of row `y` from the second on, those to their left, right, above and below.
+#[inline(always)]
+fn around(plane: &[f32], width: usize, count: usize, y: usize) -> [&[f32]; 5] {
+    [(y, 1), (y, 0), (y, 2), (y - 1, 1), (y + 1, 1)].map(|(y, x)| &plane[y * width + x..][..count])
+}
+
+for_each_isa! {
+    fn compare(band: &mut Band, view: &LevelView<'_>, motion: &Motion) = compare_kernel;
+}
+
+#[inline(always)]
+fn compare_kernel(band: &mut Band, view: &LevelView, motion: &Motion) {
+    let LevelView { level, camera, .. } = view;
+    let (width, height) = (level.width, level.height);
+    let observed = level.observed.as_slice();
+    assert!(
+        observed.len() == width * height && width >= 2 && height >= 2,
+        "one value a pixel"
+    );
+    let (right, bottom) = ((width - 1) as f32, (height - 1) as f32);
+    let (fx, fy) = (camera.fx as f32, camera.fy as f32);
+    let (cx, cy) = (camera.cx as f32, camera.cy as f32);
+    let [a, b, c] = motion.rotation;
+    let t = motion.translation;
+    let points = &band.points;
+    band.values.resize(points.depth_m.len(), 0.0);
+    let along = view.along.as_chunks::<LANES>().0;
+    let depth_m = points.depth_m.as_chunks::<LANES>().0;
+    let luminance = points.luminance.as_chunks::<LANES>().0;
+    let inverse_sd = points.inverse_sd.as_chunks::<LANES>().0;
+    let values = band.values.as_chunks_mut::<LANES>().0;
+    for (row, y) in band.rows.clone().enumerate() {
+        let down = (y as f32 - cy) / fy;
+        let start: [f32; 3] = [0, 1, 2].map(|axis| b[axis] * down + c[axis]);
+        for (step, along) in along.iter().enumerate() {
+            let at = row * view.steps() + step;
+            let (depth_m, luminance) = (&depth_m[at], &luminance[at]);
+            let mut pixel = [0u32; LANES];
+            let mut inside = [0u32; LANES];
+            let mut to_right: Lanes = [0.0; LANES];
+            let mut to_below: Lanes = [0.0; LANES];
+            for lane in 0..LANES {
+                let (z, along) = (depth_m[lane], along[lane]);
+                let q: [f32; 3] =
+                    [0, 1, 2].map(|axis| z * (a[axis] * along + start[axis]) + t[axis]);
+                let inverse = 1.0 / q[2];
+                let u = fx * (q[0] * inverse) + cx;
+                let v = fy * (q[1] * inverse) + cy;
+                let is_inside =
+                    (z > 0.0) & (q[2] > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < right) & (v < bottom);
+                let (u, v) = if is_inside { (u, v) } else { (0.0, 0.0) };
+                // Of at most 2^13.
+                let (column, row) = (u as i32, v as i32);
+                to_right[lane] = u - column as f32;
+                to_below[lane] = v - row as f32;
+                pixel[lane] = row as u32 * width as u32 + column as u32;
+                inside[lane] = u32::from(is_inside);
+            }
+            let mut four = [[0.0f32; LANES]; 4];
+            for lane in 0..LANES {
+                let pixel = pixel[lane] as usize;
+                // SAFETY: the column is below `width - 1` and the row below `height - 1`, or both are 0; the image has
+                // `width * height` values, at least 2x2.
+                unsafe {
+                    four[0][lane] = *observed.get_unchecked(pixel);
+                    four[1][lane] = *observed.get_unchecked(pixel + 1);
+                    four[2][lane] = *observed.get_unchecked(pixel + width);
+                    four[3][lane] = *observed.get_unchecked(pixel + width + 1);
+                }
+            }
+            for lane in 0..LANES {
+                let (right, down) = (to_right[lane], to_below[lane]);
+                let upper = four[0][lane] * (1.0 - right) + four[1][lane] * right;
+                let lower = four[2][lane] * (1.0 - right) + four[3][lane] * right;
+                let observed = upper * (1.0 - down) + lower * down;
+                let residual = observed - motion.gain * luminance[lane] - motion.offset;
+                let normalised = residual * inverse_sd[at][lane];
+                values[at][lane] = if inside[lane] != 0 {
+                    normalised
+                } else {
+                    f32::NAN
+                };
+            }
+        }
+    }
+}
+
+for_each_isa! {
+    fn accumulate(
+        band: &mut Band,
+        view: &LevelView<'_>,
+        gain: f32,
+        tukey: Tukey,
+    ) = accumulate_kernel;
+}
+
+#[inline(always)]
+fn accumulate_kernel(band: &mut Band, view: &LevelView, gain: f32, tukey: Tukey) {
+    let camera = view.camera;
+    let (fy, cy) = (camera.fy as f32, camera.cy as f32);
+    let inverse_scale2 = 1.0 / (tukey.scale * tukey.scale);
+    let inverse_cutoff = 1.0 / tukey.cutoff;
+    let points = &band.points;
+    let along = view.along.as_chunks::<LANES>().0;
+    let depth_m = points.depth_m.as_chunks::<LANES>().0;
+    let luminance = points.luminance.as_chunks::<LANES>().0;
+    let slope_x = points.slope_x.as_chunks::<LANES>().0;
+    let slope_y = points.slope_y.as_chunks::<LANES>().0;
+    let inverse_sd = points.inverse_sd.as_chunks::<LANES>().0;
+    let values = band.values.as_chunks::<LANES>().0;
+    band.sums = [0.0; HESSIAN + 8];
+    let mut parts = [[0.0f32; LANES]; HESSIAN + 8];
+    let mut steps = 0;
+    for (row, y) in band.rows.clone().enumerate() {
+        let b = (y as f32 - cy) / fy;
+        for (step, along) in along.iter().enumerate() {
+            let at = row * view.steps() + step;
+            let mut j = [[1.0f32; LANES]; 8];
+            let mut weight: Lanes = [0.0; LANES];
+            let mut weighted_residual: Lanes = [0.0; LANES];
+            for lane in 0..LANES {
+                // grad tau * d pi / d X, X = z (a, b, 1), then [I | -[X]x].
+                let a = along[lane];
+                let (x, y) = (gain * slope_x[at][lane], gain * slope_y[at][lane]);
+                let z = -(x * a + y * b);
+                let inverse = 1.0 / depth_m[at][lane];
+                j[0][lane] = x * inverse;
+                j[1][lane] = y * inverse;
+                j[2][lane] = z * inverse;
+                j[3][lane] = b * z - y;
+                j[4][lane] = x - a * z;
+                j[5][lane] = a * y - b * x;
+                j[6][lane] = luminance[at][lane];
+                // NaN left the image.
+                let value = values[at][lane];
+                let counts = value.abs() < tukey.cutoff;
+                let share = value * inverse_cutoff;
+                let kept = 1.0 - share * share;
+                let inverse_sd = inverse_sd[at][lane];
+                let w = kept * kept * inverse_sd * inverse_scale2;
+                weight[lane] = if counts { w * inverse_sd } else { 0.0 };
+                weighted_residual[lane] = if counts { w * value } else { 0.0 };
+            }
+            let mut entry = 0;
+            for row in 0..8 {
+                let mut weighted = [0.0f32; LANES];
+                for lane in 0..LANES {
+                    weighted[lane] = weight[lane] * j[row][lane];
+                    parts[HESSIAN + row][lane] += weighted_residual[lane] * j[row][lane];
+                }
+                for j in &j[row..] {
+                    for lane in 0..LANES {
+                        parts[entry][lane] += weighted[lane] * j[lane];
+                    }
+                    entry += 1;
+                }
+            }
+            // Single precision within some steps, double across: the sums keep their digits.
+            steps += 1;
+            if steps % STEPS_MAX == 0 {
+                flush(&mut parts, &mut band.sums);
+            }
+        }
+    }
+    flush(&mut parts, &mut band.sums);
+}
+
+#[inline(always)]
+fn flush(parts: &mut [[f32; LANES]; HESSIAN + 8], sums: &mut NormalSums) {
+    for (sum, part) in sums.iter_mut().zip(parts) {
+        *sum += part.iter().map(|&value| f64::from(value)).sum::<f64>();
+        *part = [0.0; LANES];
+    }
+}
