@@ -5,7 +5,7 @@ mod reference;
 
 use nalgebra::{Point3, Vector3};
 use reference::{
-    Random, pool,
+    Random, isas, pool,
     scene::{Panel, Scene, camera, pose},
 };
 use surprised::{
@@ -240,6 +240,31 @@ fn a_standing_robot_gets_used_to_a_new_object_within_forty_frames() {
 fn same_memory(a: &Pipeline, b: &Pipeline) -> bool {
     let (a, b) = (a.memory(), b.memory());
     a.viewpoints() == b.viewpoints() && a.bytes() == b.bytes()
+}
+
+#[test]
+fn the_number_of_threads_and_the_instruction_set_change_no_bit_of_what_is_learnt() {
+    for preset in [Preset::Paper, Preset::Robust] {
+        let mut robots: Vec<Robot> = isas()
+            .into_iter()
+            .flat_map(|isa| [(isa, 1), (isa, 2), (isa, 5)])
+            .map(|(isa, threads)| Robot {
+                pipeline: Pipeline::with_isa(Settings::preset(preset), pool(threads), isa),
+                sequence: 0,
+            })
+            .collect();
+        for step in 0..STEPS {
+            let scene = place(step > STEPS / 2);
+            let here = arc(step, 0.002);
+            let reports: Vec<Report> = robots
+                .iter_mut()
+                .map(|robot| robot.see(&scene, &here))
+                .collect();
+            assert!(reports.windows(2).all(|pair| pair[0] == pair[1]));
+        }
+        let alike = |pair: &[Robot]| same_memory(&pair[0].pipeline, &pair[1].pipeline);
+        assert!(robots.windows(2).all(alike));
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 mod reference;
 
 use reference::{
-    Random,
+    Random, isas, pool,
     room::{panel, room},
     scene::{Picture, Scene, camera, pose},
 };
@@ -60,12 +60,22 @@ fn observed(picture: &Picture, object: bool, random: &mut Random) -> Vec<f32> {
 }
 
 fn refine(case: &Case, observed: &[f32], given: &Pose, noise: PoseNoise) -> Refined {
+    refine_by(&mut PoseRefiner::default(), case, observed, given, noise)
+}
+
+fn refine_by(
+    refiner: &mut PoseRefiner,
+    case: &Case,
+    observed: &[f32],
+    given: &Pose,
+    noise: PoseNoise,
+) -> Refined {
     let views: Vec<_> = case
         .views
         .iter()
         .map(|view| (&view.coarse, &view.world_from_camera, 1.0))
         .collect();
-    PoseRefiner::default().refine(&views, observed, &case.camera, given, noise)
+    refiner.refine(&views, observed, &case.camera, given, noise)
 }
 
 /// Mean distance, pixels, between where a pose thinks that the scene is and where it is.
@@ -168,4 +178,26 @@ fn without_views_or_pixels_to_compare_the_pose_is_as_given() {
         refine(&nothing, &image, &given, noise(3.0, 0.3)),
         Refined::unchanged(given)
     );
+}
+
+#[test]
+fn the_number_of_threads_and_the_instruction_set_change_no_bit() {
+    let case = case();
+    let image = observed(&case.picture, true, &mut Random(9));
+    let given = case.truth * pose([0.008, -0.006, 0.004], [0.01, 0.005, -0.012]);
+    let mut refined = Vec::new();
+    for isa in isas() {
+        for threads in [1, 2, 5] {
+            let mut refiner = PoseRefiner::new(pool(threads), isa);
+            refined.push(refine_by(
+                &mut refiner,
+                &case,
+                &image,
+                &given,
+                noise(10.0, 1.0),
+            ));
+        }
+    }
+    assert!(refined[0].correction_m > 0.0, "it was refined");
+    assert!(refined.windows(2).all(|pair| pair[0] == pair[1]));
 }

@@ -207,33 +207,55 @@ impl Coarse {
     }
 
     /// The same, using again the memory that is there.
+    fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: MeshCut) {
+        self.mesh.halve(mesh, cut);
+        let Self {
+            luminance,
+            variance,
+            ..
+        } = self;
+        halve_luminance(records, &mesh.intrinsics, luminance, variance);
+    }
+}
+
+impl Mesh {
+    /// Becomes another one's at half resolution, as [`Coarse::mesh`] is; memory that is there is used again.
     #[inline(always)]
-    pub fn reduce(&mut self, mesh: &Mesh, records: &[Record], cut: MeshCut) {
-        let fine = mesh.intrinsics;
-        let coarse = fine.half();
-        self.mesh.intrinsics = coarse;
-        let depth_m = &mut self.mesh.depth_m;
-        for plane in [depth_m, &mut self.luminance, &mut self.variance] {
-            plane.resize(coarse.pixels(), 0.0);
-        }
+    pub fn halve(&mut self, mesh: &Mesh, cut: MeshCut) {
+        let (fine, coarse) = (mesh.intrinsics, mesh.intrinsics.half());
+        self.intrinsics = coarse;
+        self.depth_m.resize(coarse.pixels(), 0.0);
         for y in 0..coarse.height {
-            let row = y * coarse.width..(y + 1) * coarse.width;
-            let upper = 2 * y * fine.width..(2 * y + 1) * fine.width;
-            let lower = (2 * y + 1) * fine.width..(2 * y + 2) * fine.width;
             coarse_depth_row(
-                &mesh.depth_m[upper.clone()],
-                &mesh.depth_m[lower.clone()],
+                &mesh.depth_m[2 * y * fine.width..(2 * y + 1) * fine.width],
+                &mesh.depth_m[(2 * y + 1) * fine.width..(2 * y + 2) * fine.width],
                 cut,
-                &mut self.mesh.depth_m[row.clone()],
-            );
-            coarse_luminance_row(
-                &records[upper],
-                &records[lower],
-                &mut self.luminance[row.clone()],
-                &mut self.variance[row],
+                &mut self.depth_m[y * coarse.width..(y + 1) * coarse.width],
             );
         }
-        self.mesh.join(cut);
+        self.join(cut);
+    }
+}
+
+/// [`Coarse::luminance`] and [`Coarse::variance`] of a full image's records; memory that is there is used again.
+#[inline(always)]
+pub fn halve_luminance(
+    records: &[Record],
+    fine: &Intrinsics,
+    luminance: &mut Vec<f32>,
+    variance: &mut Vec<f32>,
+) {
+    let coarse = fine.half();
+    luminance.resize(coarse.pixels(), 0.0);
+    variance.resize(coarse.pixels(), 0.0);
+    for y in 0..coarse.height {
+        let row = y * coarse.width..(y + 1) * coarse.width;
+        coarse_luminance_row(
+            &records[2 * y * fine.width..(2 * y + 1) * fine.width],
+            &records[(2 * y + 1) * fine.width..(2 * y + 2) * fine.width],
+            &mut luminance[row.clone()],
+            &mut variance[row],
+        );
     }
 }
 

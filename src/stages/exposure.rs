@@ -21,37 +21,64 @@ const BINS: usize = 2048;
 
 /// `rows` yields (expected luminance, coverage, observed luminance), a row each. 1 where nothing can be compared.
 pub fn exposure_gain<'a>(rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [f32])>) -> f32 {
-    exposure_gain_on(Isa::Portable, rows)
+    let mut ratios = ExposureRatios::default();
+    for (expected, coverage, observed) in rows {
+        ratios.count(Isa::Portable, expected, coverage, observed);
+    }
+    ratios.gain()
 }
 
-/// The same bits with other instructions.
-pub fn exposure_gain_on<'a>(
-    isa: Isa,
-    rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [f32])>,
-) -> f32 {
-    // A histogram in place of sorting: clipping the ratios first does not move a median inside the bounds. The last
-    // bin is for what cannot be compared.
-    let mut histogram = [0u32; BINS + 1];
-    let mut pixels = 0;
-    for (expected, coverage, observed) in rows {
-        count_row(isa, expected, coverage, observed, &mut histogram);
-        pixels += expected.len() as u32;
-    }
-    let count = pixels - histogram[BINS];
-    let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
-    if count == 0 {
-        return 1.0;
-    }
-    let mut below = 0;
-    for (bin, &members) in histogram[..BINS].iter().enumerate() {
-        if 2 * (below + members) >= count {
-            // Where in the bin the median lies, as if its members were spread evenly.
-            let inside = (count as f32 / 2.0 - below as f32) / members as f32;
-            return GAIN_MIN + (bin as f32 + inside) / scale;
+/// The ratios of some rows, in a histogram in place of sorting: clipping them first does not move a median inside the
+/// bounds.
+#[derive(Clone)]
+pub struct ExposureRatios {
+    /// The last bin is for what cannot be compared.
+    histogram: [u32; BINS + 1],
+}
+
+impl Default for ExposureRatios {
+    fn default() -> Self {
+        Self {
+            histogram: [0; BINS + 1],
         }
-        below += members;
     }
-    GAIN_MAX
+}
+
+impl ExposureRatios {
+    pub fn clear(&mut self) {
+        self.histogram.fill(0);
+    }
+
+    /// Of a row: expected luminance, coverage, observed luminance.
+    pub fn count(&mut self, isa: Isa, expected: &[f32], coverage: &[f32], observed: &[f32]) {
+        count_row(isa, expected, coverage, observed, &mut self.histogram);
+    }
+
+    pub fn add(&mut self, other: &Self) {
+        for (sum, members) in self.histogram.iter_mut().zip(&other.histogram) {
+            *sum += members;
+        }
+    }
+
+    /// The median; 1 of none.
+    pub fn gain(&self) -> f32 {
+        let bins = &self.histogram[..BINS];
+        let count: u32 = bins.iter().sum();
+        let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
+        if count == 0 {
+            return 1.0;
+        }
+        let mut below = 0;
+        for (bin, &members) in bins.iter().enumerate() {
+            if 2 * (below + members) >= count {
+                // Where in the bin the median lies, as if its members were spread evenly.
+                let inside = (count as f32 / 2.0 - below as f32) / members as f32;
+                return GAIN_MIN + (bin as f32 + inside) / scale;
+            }
+            below += members;
+        }
+        GAIN_MAX
+    }
 }
 
 for_each_isa! {

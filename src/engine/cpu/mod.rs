@@ -4,7 +4,7 @@ mod score;
 
 mod strips;
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use arrayvec::ArrayVec;
 use rayon::{ThreadPool, prelude::*};
@@ -17,10 +17,10 @@ use crate::{
         camera::Intrinsics,
         frame::RgbImage,
         pose::Pose,
-        viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint},
+        viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint, halve_luminance},
     },
     stages::{
-        exposure::exposure_gain_on,
+        exposure::ExposureRatios,
         interpolate::{
             merge::{MergeRules, MergeView},
             prior::{self, Prior, PriorRow},
@@ -99,12 +99,21 @@ fn join_kernel(mesh: &mut Mesh, cut: MeshCut) {
 }
 
 for_each_isa! {
-    fn reduce(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) = reduce_kernel;
+    fn halve(coarse: &mut Mesh, mesh: &Mesh, cut: MeshCut) = halve_kernel;
 }
 
 #[inline(always)]
-fn reduce_kernel(coarse: &mut Coarse, mesh: &Mesh, records: &[Record], cut: MeshCut) {
-    coarse.reduce(mesh, records, cut);
+fn halve_kernel(coarse: &mut Mesh, mesh: &Mesh, cut: MeshCut) {
+    coarse.halve(mesh, cut);
+}
+
+for_each_isa! {
+    fn reduce(
+        records: &[Record],
+        fine: &Intrinsics,
+        luminance: &mut Vec<f32>,
+        variance: &mut Vec<f32>,
+    ) = halve_luminance;
 }
 
 /// What a frame did to the prior.
@@ -131,6 +140,14 @@ impl Score {
     }
 }
 
+/// Working memory of one thread.
+#[derive(Default)]
+struct Scratch {
+    strip: StripScratch,
+    score: ScoreScratch,
+    exposure: ExposureRatios,
+}
+
 pub struct CpuEngine {
     pool: Arc<ThreadPool>,
     isa: Isa,
@@ -138,7 +155,7 @@ pub struct CpuEngine {
     score_rules: ScoreRules,
     exposure_gain: bool,
     /// One a thread; never contended.
-    scratch: Vec<Mutex<(StripScratch, ScoreScratch)>>,
+    scratch: Vec<Mutex<Scratch>>,
     /// One a view.
     reaches: Mutex<[Reach; VIEWS_MAX]>,
 }
@@ -185,9 +202,26 @@ impl CpuEngine {
         coarse: Option<&mut Coarse>,
         cut: MeshCut,
     ) {
-        join(self.isa, mesh, cut);
-        if let Some(coarse) = coarse {
-            reduce(self.isa, coarse, mesh, records, cut);
+        let Some(coarse) = coarse else {
+            join(self.isa, mesh, cut);
+            return;
+        };
+        let Coarse {
+            mesh: coarse,
+            luminance,
+            variance,
+        } = coarse;
+        let fine = mesh.intrinsics;
+        let mut surface = || {
+            join(self.isa, mesh, cut);
+            halve(self.isa, coarse, mesh, cut);
+        };
+        let mut appearance = || reduce(self.isa, records, &fine, luminance, variance);
+        if self.is_alone() {
+            surface();
+            appearance();
+        } else {
+            self.pool.install(|| rayon::join(surface, appearance));
         }
     }
 
@@ -199,13 +233,26 @@ impl CpuEngine {
         world_from_camera: &Pose,
         prior: &mut Prior,
     ) {
+        self.recall_with(views, intrinsics, world_from_camera, prior, &|_, _, _| {});
+    }
+
+    /// The same, and `then` does something with every strip while it is at hand.
+    fn recall_with(
+        &self,
+        views: &[RecallView],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        prior: &mut Prior,
+        then: &(dyn Fn(usize, &[f32], &mut Scratch) + Sync),
+    ) {
         let mut reaches = self.reaches();
         let recall = Recall::new(self, views, intrinsics, world_from_camera, &mut reaches);
         prior.resize(intrinsics.width, intrinsics.height);
         let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
         let recall = |(strip, rows): (usize, &mut [f32])| {
-            let (scratch, _) = &mut *self.thread_scratch();
-            recall.strip(strip, rows, scratch);
+            let scratch = &mut *self.thread_scratch();
+            recall.strip(strip, rows, &mut scratch.strip);
+            then(strip * STRIP_ROWS, rows, scratch);
         };
         let data = &mut prior.data;
         if self.is_alone() {
@@ -222,12 +269,23 @@ impl CpuEngine {
     /// Updates the prior with an observation of the same size and measures the surprise. Returns how many pixels some
     /// view saw.
     pub fn score(&self, prior: &Prior, observation: &Observation, score: &mut Score) -> usize {
+        let gain = self.gain(prior, observation);
+        self.score_at(gain, prior, observation, score)
+    }
+
+    fn score_at(
+        &self,
+        gain: f32,
+        prior: &Prior,
+        observation: &Observation,
+        score: &mut Score,
+    ) -> usize {
         score.resize(prior, observation);
-        score.gain = self.gain(prior, observation);
+        score.gain = gain;
         let (width, inverse_gain) = (prior.width, 1.0 / score.gain);
         let strip_pixels = STRIP_ROWS * width;
         let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
-            let (_, scratch) = &mut *self.thread_scratch();
+            let scratch = &mut self.thread_scratch().score;
             let rows = strip * STRIP_ROWS..prior.height;
             let mut seen = 0;
             for (y, (surprise, posterior)) in rows.zip(
@@ -271,7 +329,7 @@ impl CpuEngine {
         }
     }
 
-    /// Recalls and scores: in one pass, while the prior is at hand, unless the score depends on pixels around.
+    /// Recalls and scores: in one pass, while the prior is at hand, unless the score depends on more than the pixel.
     pub fn compare(
         &self,
         views: &[RecallView],
@@ -281,7 +339,54 @@ impl CpuEngine {
         prior: &mut Prior,
         score: &mut Score,
     ) -> usize {
-        if self.exposure_gain || self.score_rules.looks_around() {
+        let mut compare = || {
+            self.compare_here(
+                views,
+                intrinsics,
+                world_from_camera,
+                observation,
+                prior,
+                score,
+            )
+        };
+        // Handed over once for all passes.
+        if self.is_alone() {
+            compare()
+        } else {
+            self.pool.install(compare)
+        }
+    }
+
+    fn compare_here(
+        &self,
+        views: &[RecallView],
+        intrinsics: &Intrinsics,
+        world_from_camera: &Pose,
+        observation: &Observation,
+        prior: &mut Prior,
+        score: &mut Score,
+    ) -> usize {
+        if self.exposure_gain {
+            self.forget_ratios();
+            let width = intrinsics.width;
+            let count = |first_row: usize, rows: &[f32], scratch: &mut Scratch| {
+                for (index, y) in (first_row..)
+                    .take(rows.len() / (width * prior::PLANES))
+                    .enumerate()
+                {
+                    let row = PriorRow::of(rows, index, width);
+                    scratch.exposure.count(
+                        self.isa,
+                        row.plane(prior::TAU),
+                        row.plane(prior::COVERAGE),
+                        observation.row(y)[0],
+                    );
+                }
+            };
+            self.recall_with(views, intrinsics, world_from_camera, prior, &count);
+            return self.score_at(self.gain_of_ratios(), prior, observation, score);
+        }
+        if self.score_rules.looks_around() {
             self.recall(views, intrinsics, world_from_camera, prior);
             return self.score(prior, observation, score);
         }
@@ -293,7 +398,11 @@ impl CpuEngine {
         score.gain = 1.0;
         type Strip<'a> = ((&'a mut [f32], &'a mut [f32]), &'a mut [Record]);
         let both = |(strip, ((rows, surprise), posterior)): (usize, Strip)| {
-            let (recall_scratch, scratch) = &mut *self.thread_scratch();
+            let Scratch {
+                strip: recall_scratch,
+                score: scratch,
+                ..
+            } = &mut *self.thread_scratch();
             recall.strip(strip, rows, recall_scratch);
             let mut seen = 0;
             for (row, (surprise, posterior)) in surprise
@@ -343,18 +452,35 @@ impl CpuEngine {
         if !self.exposure_gain {
             return 1.0;
         }
-        let rows = (0..prior.height).map(|y| {
+        let mut ratios = ExposureRatios::default();
+        for y in 0..prior.height {
             let row = prior.row(y);
-            (
+            ratios.count(
+                self.isa,
                 row.plane(prior::TAU),
                 row.plane(prior::COVERAGE),
                 observation.row(y)[0],
-            )
-        });
-        exposure_gain_on(self.isa, rows)
+            );
+        }
+        ratios.gain()
     }
 
-    fn reaches(&self) -> std::sync::MutexGuard<'_, [Reach; VIEWS_MAX]> {
+    fn forget_ratios(&self) {
+        for scratch in &self.scratch {
+            locked(scratch).exposure.clear();
+        }
+    }
+
+    /// Of what all threads counted.
+    fn gain_of_ratios(&self) -> f32 {
+        let mut ratios = ExposureRatios::default();
+        for scratch in &self.scratch {
+            ratios.add(&locked(scratch).exposure);
+        }
+        ratios.gain()
+    }
+
+    fn reaches(&self) -> MutexGuard<'_, [Reach; VIEWS_MAX]> {
         self.reaches
             .lock()
             .expect("never held by a panicked caller")
@@ -365,13 +491,17 @@ impl CpuEngine {
         self.pool.current_num_threads() == 1
     }
 
-    fn thread_scratch(&self) -> std::sync::MutexGuard<'_, (StripScratch, ScoreScratch)> {
+    fn thread_scratch(&self) -> MutexGuard<'_, Scratch> {
         // The caller's own thread where there is only one.
         let thread = self.pool.current_thread_index().unwrap_or(0);
-        self.scratch[thread]
-            .lock()
-            .expect("a thread that panicked ends the process")
+        locked(&self.scratch[thread])
     }
+}
+
+fn locked(scratch: &Mutex<Scratch>) -> MutexGuard<'_, Scratch> {
+    scratch
+        .lock()
+        .expect("a thread that panicked ends the process")
 }
 
 /// Views on their way into a prior.

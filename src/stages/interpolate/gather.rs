@@ -83,11 +83,17 @@ impl Source {
     /// The three records of a lane, in the order of the weights.
     #[inline(always)]
     pub fn records<'a>(&self, lane: usize, view: &GatherView<'a>) -> [&'a Record; 3] {
+        self.corners(lane, view.width).map(|at| &view.records[at])
+    }
+
+    /// Where they lie in a view so wide.
+    #[inline(always)]
+    pub fn corners(&self, lane: usize, width: usize) -> [usize; 3] {
         let upper_left = self.upper_left[lane] as usize;
         [
-            &view.records[self.corner[lane] as usize],
-            &view.records[upper_left + 1],
-            &view.records[upper_left + view.width],
+            self.corner[lane] as usize,
+            upper_left + 1,
+            upper_left + width,
         ]
     }
 }

@@ -335,8 +335,9 @@ fn compare_kernel(band: &mut Band, view: &LevelView, motion: &Motion) {
                 let is_inside =
                     (z > 0.0) & (q[2] > 0.0) & (u >= 0.0) & (v >= 0.0) & (u < right) & (v < bottom);
                 let (u, v) = if is_inside { (u, v) } else { (0.0, 0.0) };
-                // Of at most 2^13.
-                let (column, row) = (u as i32, v as i32);
+                // SAFETY: neither is below 0 or above 2^13, the longest side.
+                let (column, row): (i32, i32) =
+                    unsafe { (u.to_int_unchecked(), v.to_int_unchecked()) };
                 to_right[lane] = u - column as f32;
                 to_below[lane] = v - row as f32;
                 pixel[lane] = row as u32 * width as u32 + column as u32;

@@ -5,9 +5,11 @@
 
 use crate::{
     isa::{Isa, for_each_isa},
+    lanes::{LANES, Lanes},
     model::{camera::Intrinsics, pose::Pose, viewpoint::Coarse},
-    stages::interpolate::project::{
-        ProjectScratch, Projector, Sample, draw, map_size, sample_depth_m, sample_position,
+    stages::interpolate::{
+        gather::Source,
+        project::{ProjectScratch, Projector, Sample, draw, map_size},
     },
 };
 
@@ -99,77 +101,121 @@ for_each_isa! {
 #[inline(always)]
 fn expect_kernel(views: &[(&Coarse, &Pose, f32)], maps: &[Sample], rows: &mut LevelRows) {
     let pixels = rows.luminance.len();
-    for pixel in 0..pixels {
-        let mut seen = [(0.0f32, 0.0f32, 0.0f32, 0.0f32); REFINE_VIEWS];
-        let mut count = 0;
-        for (view, (coarse, _, weight)) in views.iter().enumerate() {
-            let sample = maps[view * map_size(pixels) + pixel];
-            if sample != 0 {
-                let (luminance, variance) = interpolate(coarse, sample);
-                seen[count] = (sample_depth_m(sample), luminance, variance, *weight);
-                count += 1;
+    for start in (0..pixels).step_by(LANES) {
+        let count = LANES.min(pixels - start);
+        let mut seen = [Seen::NONE; REFINE_VIEWS];
+        let maps = maps.chunks_exact(map_size(pixels));
+        for (seen, ((coarse, _, weight), map)) in seen.iter_mut().zip(views.iter().zip(maps)) {
+            let Intrinsics { width, height, .. } = coarse.mesh.intrinsics;
+            // A smaller view has no triangle. A map reaches a step beyond its last pixel.
+            if let (Some(samples), true) =
+                (map[start..].first_chunk::<LANES>(), width.min(height) > 1)
+            {
+                seen.read(coarse, samples, *weight);
             }
         }
-        let (luminance, variance, depth_m) = if count > 0 {
-            merge(&mut seen[..count])
-        } else {
-            (0.0, 0.0, 0.0)
-        };
-        rows.luminance[pixel] = luminance;
-        rows.variance[pixel] = variance;
-        rows.depth_m[pixel] = depth_m;
+        let [luminance, variance, depth_m] = merge(&seen);
+        rows.luminance[start..start + count].copy_from_slice(&luminance[..count]);
+        rows.variance[start..start + count].copy_from_slice(&variance[..count]);
+        rows.depth_m[start..start + count].copy_from_slice(&depth_m[..count]);
     }
 }
 
-/// Luminance and variance inside the triangle around a sample.
-#[inline(always)]
-fn interpolate(coarse: &Coarse, sample: Sample) -> (f32, f32) {
-    let Intrinsics { width, height, .. } = coarse.mesh.intrinsics;
-    let (column, row, mut right, mut down) = sample_position(sample);
-    right += if column > width - 2 { 1.0 } else { 0.0 };
-    down += if row > height - 2 { 1.0 } else { 0.0 };
-    let upper_left = row.min(height - 2) * width + column.min(width - 2);
-    let (upper_right, lower_left) = (upper_left + 1, upper_left + width);
-    let (corner, weights) = if right + down <= 1.0 {
-        (upper_left, [1.0 - right - down, right, down])
-    } else {
-        (
-            lower_left + 1,
-            [right + down - 1.0, 1.0 - down, 1.0 - right],
-        )
+/// What a view says about sixteen pixels.
+#[derive(Clone, Copy)]
+struct Seen {
+    /// Infinite where unseen.
+    depth_m: Lanes,
+    luminance: Lanes,
+    variance: Lanes,
+    weight: f32,
+}
+
+impl Seen {
+    const NONE: Self = Self {
+        depth_m: [f32::INFINITY; LANES],
+        luminance: [0.0; LANES],
+        variance: [0.0; LANES],
+        weight: 0.0,
     };
-    let corners = [corner, upper_right, lower_left];
-    corners
-        .into_iter()
-        .zip(weights)
-        .fold((0.0, 0.0), |(luminance, variance), (pixel, weight)| {
-            (
-                luminance + weight * coarse.luminance[pixel],
-                variance + weight * coarse.variance[pixel],
-            )
-        })
+
+    /// Luminance and variance inside the triangles around the samples.
+    #[inline(always)]
+    fn read(&mut self, coarse: &Coarse, samples: &[Sample; LANES], weight: f32) {
+        let Intrinsics { width, height, .. } = coarse.mesh.intrinsics;
+        let mut source = Source::NONE;
+        source.locate(samples, width as u32, height as u32);
+        let mut corners = [[[0.0f32; LANES]; 3]; 2];
+        for lane in 0..LANES {
+            let at = source.corners(lane, width);
+            for (plane, corners) in [&coarse.luminance, &coarse.variance]
+                .into_iter()
+                .zip(&mut corners)
+            {
+                for (corner, at) in corners.iter_mut().zip(at) {
+                    corner[lane] = plane[at];
+                }
+            }
+        }
+        let interpolate = |corners: &[Lanes; 3], lane: usize| {
+            corners[0][lane] * source.weights[0][lane]
+                + corners[1][lane] * source.weights[1][lane]
+                + corners[2][lane] * source.weights[2][lane]
+        };
+        for lane in 0..LANES {
+            // 1/0 where unseen.
+            self.depth_m[lane] = 1.0 / source.inverse_depth[lane];
+            self.luminance[lane] = interpolate(&corners[0], lane);
+            self.variance[lane] = interpolate(&corners[1], lane);
+        }
+        self.weight = weight;
+    }
 }
 
-/// `(depth, luminance, variance, weight)` of the views that see a pixel -> luminance, variance with their disagreement,
-/// and depth of those near the middle depth.
-fn merge(seen: &mut [(f32, f32, f32, f32)]) -> (f32, f32, f32) {
-    seen.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
-    let middle = seen[(seen.len() - 1) / 2].0;
-    let kept = seen
-        .iter()
-        .filter(|view| (view.0 - middle).abs() <= DEPTH_TOLERANCE * middle);
-    let (mut total, mut depth_m, mut luminance, mut square, mut variance) =
-        (0.0, 0.0, 0.0, 0.0, 0.0);
-    for &(z, y, v, weight) in kept {
-        total += weight;
-        depth_m += weight * z;
-        luminance += weight * y;
-        square += weight * y * y;
-        variance += weight * v;
+/// Luminance, variance with the views' disagreement, and depth, of those near the middle depth, the lower of two; 0 where
+/// no view sees anything.
+#[inline(always)]
+fn merge(seen: &[Seen; REFINE_VIEWS]) -> [Lanes; 3] {
+    let mut merged = [[0.0; LANES]; 3];
+    for lane in 0..LANES {
+        let [a, b, c] = [0, 1, 2].map(|view| seen[view].depth_m[lane]);
+        let (low, high) = if a < b { (a, b) } else { (b, a) };
+        let nearest = if low < c { low } else { c };
+        let upper = if low < c { c } else { low };
+        let middle = if high < upper { high } else { upper };
+        let farthest = if high < upper { upper } else { high };
+        let middle = if farthest < f32::INFINITY {
+            middle
+        } else {
+            nearest
+        };
+        let (mut total, mut depth_m, mut luminance, mut square, mut variance) =
+            (0.0, 0.0, 0.0, 0.0, 0.0);
+        for seen in seen {
+            let z = seen.depth_m[lane];
+            // Infinity less infinity is no number.
+            let kept = (z - middle).abs() <= DEPTH_TOLERANCE * middle;
+            let weight = if kept { seen.weight } else { 0.0 };
+            let y = seen.luminance[lane];
+            total += weight;
+            depth_m += weight * if kept { z } else { 0.0 };
+            luminance += weight * y;
+            square += weight * y * y;
+            variance += weight * seen.variance[lane];
+        }
+        let scale = if total > 0.0 { 1.0 / total } else { 0.0 };
+        let luminance = luminance * scale;
+        let disagreement = square * scale - luminance * luminance;
+        let disagreement = if disagreement > 0.0 {
+            disagreement
+        } else {
+            0.0
+        };
+        merged[0][lane] = luminance;
+        merged[1][lane] = variance * scale + disagreement;
+        merged[2][lane] = depth_m * scale;
     }
-    let luminance = luminance / total;
-    let disagreement = (square / total - luminance * luminance).max(0.0);
-    (luminance, variance / total + disagreement, depth_m / total)
+    merged
 }
 
 for_each_isa! {
