@@ -184,6 +184,7 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             image_width,
             inverse_discount,
             image_focal,
+            image_center,
             position_sd_m,
             rotation_sd_rad,
         }),
@@ -196,6 +197,7 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             offset,
             level_count,
             point_count,
+            accepted,
         }),
     ];
     for (name, fields, size) in structs {

@@ -33,6 +33,8 @@ pub enum Slot {
     Pyramid,
     PartialSums,
     Estimate,
+    /// As [`Self::Views`], before a camera that is where its pose says.
+    GivenViews,
 }
 
 impl Slot {
@@ -64,6 +66,7 @@ impl Slot {
             Self::Pyramid => "pyramid",
             Self::PartialSums => "partial_sums",
             Self::Estimate => "estimate",
+            Self::GivenViews => "given_views",
         }
     }
 }
@@ -96,6 +99,7 @@ const PREDICT: &str = shader!(
 );
 const COMPARE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/compare.wgsl");
 const SOLVE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/solve.wgsl");
+const PLACE_VIEWS: &str = shader!("layout.wgsl", "refine.wgsl", "passes/place.wgsl");
 const MERGE: &str = shader!(
     "layout.wgsl",
     "belief.wgsl",
@@ -173,6 +177,8 @@ pub const ACCUMULATE: usize = 14;
 pub const BEGIN: usize = 15;
 pub const STEP: usize = 16;
 pub const JUDGE: usize = 17;
+/// One a view.
+pub const PLACE: usize = 18;
 
 /// Pixels of one invocation of [`EXPOSE`].
 pub const EXPOSE_PIXELS: u32 = 32;
@@ -186,7 +192,7 @@ pub const SUMS: u32 = 47;
 pub const HISTOGRAM_WORDS: u64 = 2048 + 1;
 
 /// What compares a frame, in its order, and then what refines its pose before that.
-pub const PASSES: [Pass; 18] = [
+pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project depth",
         source: PROJECT,
@@ -370,5 +376,18 @@ pub const PASSES: [Pass; 18] = [
         entry: "judge",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: SOLVED,
+    },
+    Pass {
+        label: "place",
+        source: PLACE_VIEWS,
+        entry: "place",
+        workgroup: [16, 1, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (1, Slot::Level),
+            (2, Slot::Estimate),
+            (3, Slot::GivenViews),
+            (4, Slot::Views),
+        ],
     },
 ];
