@@ -45,13 +45,19 @@ use surprised::{
     },
 };
 
+/// Counted by `tests/run`, and said where nothing is captured.
+fn skipped(why: &str) {
+    println!("skipped: {why}");
+    // Not by a macro: the harness would swallow it.
+    writeln!(std::io::stderr(), "SKIPPED: {why}").expect("stderr is open");
+}
+
 /// `None`, and a loud word, where there is no adapter.
 fn card_engines(rules: CardRules) -> Option<Engines> {
     match Card::open(rules) {
         Ok(card) => Some(Engines::on(card, pool(1), isas()[0])),
         Err(EngineError::NoAdapter) => {
-            // Not by a macro: the harness would swallow it.
-            writeln!(std::io::stderr(), "SKIPPED: no adapter").expect("stderr is open");
+            skipped("no adapter");
             None
         }
         Err(error) => panic!("{error}"),
@@ -245,6 +251,37 @@ fn any_image(random: &mut Random, view: &Viewpoint) -> RgbImage {
         height: view.mesh.intrinsics.height,
         data,
     }
+}
+
+#[test]
+fn a_prior_read_in_half_precision_is_the_same_to_the_bit() {
+    let settings = Settings::robust();
+    let priors: Vec<Prior> = [true, false]
+        .into_iter()
+        .map_while(|half_precision| {
+            let rules = CardRules {
+                half_precision,
+                ..CardRules::any()
+            };
+            let engines = card_engines(rules)?;
+            if engines.card()?.has_half_precision() != half_precision {
+                skipped("no half precision");
+                return None;
+            }
+            let (target, world_from_target) = target();
+            let views = numbered(0, views(&mut Random(5), true));
+            let mut prior = Prior::default();
+            let mut engine = engines.engine(&settings);
+            engine.recall(&views.recall(), &target, &world_from_target, &mut prior);
+            assert_eq!(counters(&engine).on_processor, 0);
+            Some(prior)
+        })
+        .collect();
+    let [native, portable] = &priors[..] else {
+        return;
+    };
+    assert!(native.plane(prior::COVERAGE).filter(|&c| c > 0.0).count() > 1000);
+    assert!(native.data == portable.data);
 }
 
 #[test]

@@ -76,6 +76,8 @@ impl Slot {
 pub struct Pass {
     pub label: &'static str,
     pub source: &'static str,
+    /// The same with half precision, for cards that have it.
+    pub source_f16: Option<&'static str>,
     pub entry: &'static str,
     pub workgroup: [u32; 3],
     /// Binding numbers of group 0.
@@ -101,6 +103,16 @@ const COMPARE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/compare.wgsl
 const SOLVE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/solve.wgsl");
 const PLACE_VIEWS: &str = shader!("layout.wgsl", "refine.wgsl", "passes/place.wgsl");
 const MERGE: &str = shader!(
+    "layout.wgsl",
+    "belief.wgsl",
+    "records.wgsl",
+    "project.wgsl",
+    "merge.wgsl",
+    "passes/merge.wgsl"
+);
+/// An extension is enabled before anything else.
+const MERGE_F16: &str = shader!(
+    "records_f16.wgsl",
     "layout.wgsl",
     "belief.wgsl",
     "project.wgsl",
@@ -196,6 +208,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project depth",
         source: PROJECT,
+        source_f16: None,
         entry: "project_depth",
         workgroup: [8, 8, 1],
         bindings: DRAWN,
@@ -203,6 +216,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project triangle",
         source: PROJECT,
+        source_f16: None,
         entry: "project_triangle",
         workgroup: [8, 8, 1],
         bindings: DRAWN,
@@ -210,6 +224,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "merge",
         source: MERGE,
+        source_f16: Some(MERGE_F16),
         entry: "merge",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -229,6 +244,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "expose",
         source: EXPOSURE,
+        source_f16: None,
         entry: "expose",
         workgroup: [256, 1, 1],
         bindings: &[
@@ -242,6 +258,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "gain",
         source: EXPOSURE,
+        source_f16: None,
         entry: "gain",
         workgroup: [256, 1, 1],
         bindings: &[(1, Slot::Rules), (5, Slot::Histogram), (6, Slot::Exposure)],
@@ -249,6 +266,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "score",
         source: SCORE,
+        source_f16: None,
         entry: "score",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -267,6 +285,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "block means",
         source: ATTEND,
+        source_f16: None,
         entry: "means",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -278,6 +297,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "block medians",
         source: ATTEND,
+        source_f16: None,
         entry: "median",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -289,6 +309,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project coarse depth",
         source: PROJECT,
+        source_f16: None,
         entry: "project_depth",
         workgroup: [8, 8, 1],
         bindings: DRAWN_COARSE,
@@ -296,6 +317,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project coarse triangle",
         source: PROJECT,
+        source_f16: None,
         entry: "project_triangle",
         workgroup: [8, 8, 1],
         bindings: DRAWN_COARSE,
@@ -303,6 +325,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "expect",
         source: PREDICT,
+        source_f16: None,
         entry: "expect",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -320,6 +343,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "halve",
         source: PREDICT,
+        source_f16: None,
         entry: "halve",
         workgroup: [8, 8, 1],
         bindings: &[(2, Slot::Level), (8, Slot::Pyramid)],
@@ -327,6 +351,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "depths",
         source: COMPARE,
+        source_f16: None,
         entry: "depths",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[(0, Slot::Level), (2, Slot::Pyramid), (3, Slot::Histogram)],
@@ -334,6 +359,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "magnitudes",
         source: COMPARE,
+        source_f16: None,
         entry: "magnitudes",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[
@@ -346,6 +372,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "accumulate",
         source: COMPARE,
+        source_f16: None,
         entry: "accumulate",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[
@@ -359,6 +386,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "begin",
         source: SOLVE,
+        source_f16: None,
         entry: "begin",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[(0, Slot::Level), (1, Slot::Estimate), (2, Slot::Histogram)],
@@ -366,6 +394,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "step",
         source: SOLVE,
+        source_f16: None,
         entry: "step",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: SOLVED,
@@ -373,6 +402,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "judge",
         source: SOLVE,
+        source_f16: None,
         entry: "judge",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: SOLVED,
@@ -380,6 +410,7 @@ pub const PASSES: [Pass; 19] = [
     Pass {
         label: "place",
         source: PLACE_VIEWS,
+        source_f16: None,
         entry: "place",
         workgroup: [16, 1, 1],
         bindings: &[
