@@ -36,6 +36,7 @@ fn assert_posterior(got: &Belief, expected: &joint::Scored, size: [f32; 3], cont
 
 #[test]
 fn a_pixel_has_the_papers_posterior_and_surprise() {
+    let mut worst = 0.0f64;
     for preset in PRESETS {
         for forgetting in [0.5, 0.6, 0.7, 0.8, 0.9] {
             let settings = Settings {
@@ -59,11 +60,12 @@ fn a_pixel_has_the_papers_posterior_and_surprise() {
                 let size = std::array::from_fn(|c| prior.tau[c].abs().max(x[c].abs()));
                 assert_posterior(&posterior, &expected, size, &context);
                 let got = surprise(&prior, &posterior, x, &gamma);
-                assert_surprise(got, expected.surprise, &context);
+                worst = worst.max(assert_surprise(got, expected.surprise, &context));
                 assert!(got >= 0.0);
             }
         }
     }
+    println!("surprise within {worst:.1e} of itself");
 }
 
 struct Fabricated {
@@ -112,6 +114,7 @@ fn fabricated(random: &mut Random, rules: &UpdateRules, smooth: bool) -> Fabrica
 #[test]
 fn the_engine_scores_an_image_as_the_paper_and_the_robust_steps_say() {
     let mut exchanged = 0;
+    let mut worst = 0.0f64;
     for preset in PRESETS {
         for smooth in [false, true] {
             let settings = Settings::preset(preset);
@@ -145,7 +148,8 @@ fn the_engine_scores_an_image_as_the_paper_and_the_robust_steps_say() {
                         &settings,
                     );
                     let context = format!("{preset:?} ({x}, {y}) {belief:?} sees {observed:?}");
-                    assert_surprise(score.surprise[pixel], expected.surprise, &context);
+                    let error = assert_surprise(score.surprise[pixel], expected.surprise, &context);
+                    worst = worst.max(error);
                     // On a threshold either decision is right.
                     let threshold = f64::from(settings.surprise_threshold);
                     let decided = (expected.surprise - threshold).abs() > 0.01
@@ -160,6 +164,7 @@ fn the_engine_scores_an_image_as_the_paper_and_the_robust_steps_say() {
             }
         }
     }
+    println!("surprise of an image within {worst:.1e} of itself");
     assert!(exchanged > 1000, "only {exchanged} appearances came back");
 }
 

@@ -260,10 +260,9 @@ pub fn assert_stored(got: &Belief, expected: &Scored, context: &str) {
     );
 }
 
-pub fn assert_surprise(got: f32, expected: f64, context: &str) {
-    let error = (f64::from(got) - expected).abs();
-    assert!(
-        error <= 1e-4 * expected.max(0.01),
-        "{got} nats are not {expected}: {context}"
-    );
+/// Returns the error as a share of the expected surprise, of 0.01 nats at least.
+pub fn assert_surprise(got: f32, expected: f64, context: &str) -> f64 {
+    let error = (f64::from(got) - expected).abs() / expected.max(0.01);
+    assert!(error <= 1e-4, "{got} nats are not {expected}: {context}");
+    error
 }

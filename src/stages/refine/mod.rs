@@ -80,6 +80,14 @@ impl Refined {
             correction_rad: 0.0,
         }
     }
+
+    pub fn moved(world_from_given: &Pose, given_from_real: &Pose) -> Self {
+        Self {
+            world_from_camera: world_from_given * given_from_real,
+            correction_m: given_from_real.translation.vector.norm(),
+            correction_rad: given_from_real.rotation.angle(),
+        }
+    }
 }
 
 /// The noise that refinement assumes.
@@ -104,7 +112,7 @@ pub fn precision(noise: PoseNoise) -> [f64; 8] {
 
 /// The refined pose, if it explains the image better than the given one and lies within what the noise allows.
 /// Mismatches are mean capped residuals, predicted standard deviations.
-pub fn accepted(
+fn accepted(
     world_from_given: &Pose,
     given_from_real: &Pose,
     noise: PoseNoise,
@@ -121,11 +129,7 @@ pub fn accepted(
         };
         motion[axis].abs() < CORRECTION_SD_MAX * sd
     });
-    (improved && in_bounds).then(|| Refined {
-        world_from_camera: world_from_given * given_from_real,
-        correction_m: given_from_real.translation.vector.norm(),
-        correction_rad: given_from_real.rotation.angle(),
-    })
+    (improved && in_bounds).then(|| Refined::moved(world_from_given, given_from_real))
 }
 
 /// What is estimated: the real camera is `given * camera_from_real`, and Y = gain * tau + offset.
