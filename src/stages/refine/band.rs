@@ -27,11 +27,12 @@ pub type NormalSums = [f64; HESSIAN + 8];
 /// Steps of sixteen pixels that are added up in single precision.
 const STEPS_MAX: usize = 64;
 
-/// Bins of a histogram over magnitudes: eight to an octave.
-const BINS: usize = 1 << (31 - BIN_SHIFT);
-const BIN_SHIFT: u32 = 20;
-/// Where NaN falls, which is no magnitude.
-const NAN_BIN: usize = (f32::NAN.to_bits() >> BIN_SHIFT) as usize;
+/// Bins of a histogram over magnitudes: 64 to an octave, so that few values share one with the middle; the first and the
+/// last are open. One more is for NaN, which is no magnitude.
+const BINS: usize = 24 * 64;
+const BIN_SHIFT: u32 = f32::MANTISSA_DIGITS - 1 - 6;
+/// Of the first: magnitudes of 2^-12.
+const FIRST_BIN: u32 = (127 - 12) << 6;
 
 /// A level as a camera sees it.
 pub struct LevelView<'a> {
@@ -88,6 +89,7 @@ pub struct Band {
     /// The values of the bin that the middle falls into.
     members: Vec<f32>,
     sums: NormalSums,
+    mismatch: f64,
 }
 
 impl Default for Band {
@@ -100,6 +102,7 @@ impl Default for Band {
             histogram: Vec::new(),
             members: Vec::new(),
             sums: [0.0; HESSIAN + 8],
+            mismatch: 0.0,
         }
     }
 }
@@ -153,12 +156,16 @@ impl Band {
         &self.sums
     }
 
-    /// Sum of the capped residuals' magnitudes.
-    pub fn mismatch(&self) -> f64 {
+    /// Adds up the capped residuals' magnitudes.
+    pub fn judge(&mut self) {
         let counted = self.values.iter().filter(|value| !value.is_nan());
-        counted
+        self.mismatch = counted
             .map(|value| f64::from(value.abs().min(RESIDUAL_CAP)))
-            .sum()
+            .sum();
+    }
+
+    pub fn mismatch(&self) -> f64 {
+        self.mismatch
     }
 
     /// Keeps the values of one bin apart.
@@ -175,11 +182,11 @@ impl Band {
 pub fn middle_bin(bands: &[Band]) -> (usize, Option<(usize, usize)>) {
     let mut histogram = [0u32; BINS];
     for band in bands {
+        // Without the last, for NaN.
         for (sum, members) in histogram.iter_mut().zip(&band.histogram) {
             *sum += members;
         }
     }
-    histogram[NAN_BIN] = 0;
     let count = histogram.iter().sum::<u32>() as usize;
     let mut rank = count / 2;
     for (bin, &members) in histogram.iter().enumerate() {
@@ -193,8 +200,29 @@ pub fn middle_bin(bands: &[Band]) -> (usize, Option<(usize, usize)>) {
 }
 
 #[inline(always)]
-fn bin(value: f32) -> usize {
-    (value.to_bits() >> BIN_SHIFT) as usize % BINS
+fn bin(value: f32) -> u32 {
+    let bin = (value.abs().to_bits() >> BIN_SHIFT).max(FIRST_BIN) - FIRST_BIN;
+    let bin = bin.min(BINS as u32 - 1);
+    if value.is_nan() { BINS as u32 } else { bin }
+}
+
+/// Of sixteen values, or fewer and NaN.
+#[inline(always)]
+fn sixteen_bins(values: &[f32]) -> [u32; LANES] {
+    let mut bins = [BINS as u32; LANES];
+    match values.first_chunk::<LANES>() {
+        Some(values) => {
+            for lane in 0..LANES {
+                bins[lane] = bin(values[lane]);
+            }
+        }
+        None => {
+            for (slot, value) in bins.iter_mut().zip(values) {
+                *slot = bin(*value);
+            }
+        }
+    }
+    bins
 }
 
 for_each_isa! {
@@ -204,15 +232,14 @@ for_each_isa! {
 #[inline(always)]
 fn count_kernel(band: &mut Band) {
     band.histogram.clear();
-    band.histogram.resize(BINS, 0);
+    band.histogram.resize(BINS + 1, 0);
     // As many as there can be, so that no frame allocates.
     band.members.clear();
     band.members.reserve(band.values.len());
-    let Some(histogram) = band.histogram.first_chunk_mut::<BINS>() else {
-        return;
-    };
-    for &value in &band.values {
-        histogram[bin(value)] += 1;
+    for values in band.values.chunks(LANES) {
+        for bin in sixteen_bins(values) {
+            band.histogram[bin as usize] += 1;
+        }
     }
 }
 
@@ -222,14 +249,12 @@ for_each_isa! {
 
 #[inline(always)]
 fn pick_kernel(band: &mut Band, wanted: usize) {
-    let (steps, rest) = band.values.as_chunks::<LANES>();
-    for step in steps {
-        for lane in members(bits(|lane| bin(step[lane]) == wanted)) {
-            band.members.push(step[lane].abs());
+    for values in band.values.chunks(LANES) {
+        let bins = sixteen_bins(values);
+        for lane in members(bits(|lane| bins[lane] == wanted as u32)) {
+            band.members.push(values[lane].abs());
         }
     }
-    let rest = rest.iter().filter(|value| bin(**value) == wanted);
-    band.members.extend(rest.map(|value| value.abs()));
 }
 
 for_each_isa! {

@@ -158,6 +158,9 @@ struct Work {
     members: Vec<f32>,
 }
 
+/// Fewer bands are done sooner than they are shared out.
+const SHARED_BANDS_MIN: usize = 4;
+
 /// How the bands are worked on.
 #[derive(Clone, Copy)]
 struct Crew {
@@ -174,7 +177,7 @@ impl Crew {
     }
 
     fn sum(self, bands: &mut [Band], work: impl Fn(&mut Band) -> usize + Send + Sync) -> usize {
-        if self.is_alone || bands.len() < 2 {
+        if self.is_alone || bands.len() < SHARED_BANDS_MIN {
             bands.iter_mut().map(work).sum()
         } else {
             bands.par_iter_mut().with_max_len(1).map(work).sum()
@@ -187,11 +190,11 @@ impl Crew {
         let (count, Some((bin, rank))) = middle_bin(bands) else {
             return (0, 0.0);
         };
-        self.each(bands, |band| band.pick(self.isa, bin));
         members.clear();
         // As many as there can be, so that no frame allocates.
         members.reserve(count);
         for band in bands {
+            band.pick(self.isa, bin);
             members.extend_from_slice(band.members());
         }
         let (_, middle, _) = members.select_nth_unstable_by(rank, f32::total_cmp);
@@ -502,6 +505,7 @@ impl Comparison<'_> {
     /// Mean capped residual, predicted standard deviations.
     fn mismatch(&mut self, estimate: &Estimate) -> f64 {
         self.compare(estimate);
+        self.crew.each(self.bands, Band::judge);
         let (compared, _) = middle_bin(self.bands);
         let sum: f64 = self.bands.iter().map(Band::mismatch).sum();
         if compared == 0 {
