@@ -258,6 +258,11 @@ impl Pipeline {
         looked
     }
 
+    /// Goes on with an event that was told of before, as after a restart.
+    pub fn resume_event(&mut self, event: Event) {
+        self.events.resume(event);
+    }
+
     /// What the frame that was looked at says about the place's events, before its depth becomes a viewpoint's.
     fn follow_events(&mut self, frame: &Frame, report: &mut Report) -> Vec<Event> {
         let mut events = std::mem::take(&mut self.events);
