@@ -14,8 +14,8 @@
 //!
 //! Of the 6.8: recall 5.0, score 0.9, prepare 0.2, observe 0.1; of the 11.5: refine 1.7, recall 7.1, score 2.2, prepare
 //! 0.4. Drawing the meshes and gathering the records are 2 ms of recall each, merging 1; it takes 0.80, 0.72 and 0.76 ms a
-//! view with 3, 7 and 15 views. On two threads, never both undisturbed, by the clock: `paper` 3.4 where one took 5.8,
-//! `robust` 7.0 where one took 10.0; at 640x480 16.3 and 33.5 where one took 27.1 and 42.3. `peers.py`, least of 60, with
+//! view with 3, 7 and 15 views. On two threads, rarely undisturbed, by the clock: `paper` 3.2 where one took 5.4, `robust`
+//! 6.8 where one took 10.7; at 640x480 14.8 of 26.2 and 27.4 of 44.0. `peers.py`, least of 60, with
 //! refinement by one thread still: at 320x240 `paper` 7.3, `robust` 12.9, remap of 70 planes 13.2, interleaved 5.1, MOG2
 //! 2.3, KNN 4.7, NumPy + SciPy 12.4; at 640x480 27.2, 50.0, 49.5, 17.9, 9.8, 20.7, 58.6. Seven of 1,000,000 viewpoints are
 //! selected in 0.006 ms.
