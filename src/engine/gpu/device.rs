@@ -6,9 +6,13 @@ use std::{
 };
 
 use super::passes::{PASSES, Pass};
+use crate::model::belief::Record;
 
 /// A frame takes milliseconds; a device that is silent for so long will not answer.
 const PATIENCE: Duration = Duration::from_secs(20);
+
+/// Of what the shaders' arrays hold: a stored belief.
+const ELEMENT_BYTES_MAX: u64 = size_of::<Record>() as u64;
 
 /// Why a device cannot go on.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -111,8 +115,8 @@ impl Device {
     pub fn buffer(&self, label: &str, bytes: u64, usage: wgpu::BufferUsages) -> wgpu::Buffer {
         self.device.create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
-            // A binding must not be empty, a copy takes whole words.
-            size: bytes.next_multiple_of(16).max(16),
+            // A binding must hold an element, a copy takes whole words.
+            size: bytes.next_multiple_of(16).max(ELEMENT_BYTES_MAX),
             usage,
             mapped_at_creation: false,
         })
