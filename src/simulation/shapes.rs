@@ -75,9 +75,10 @@ pub struct Crossing {
 #[derive(Debug, Clone, Copy)]
 pub struct Surface {
     pub normal: Vector3<f64>,
+    /// The direction in which u grows, of unit length.
+    pub right: Vector3<f64>,
     pub u: f64,
     pub v: f64,
-    pub part: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -439,9 +440,9 @@ impl Shape {
                 let offset = point - disc.center;
                 Surface {
                     normal: disc.normal,
+                    right: Vector3::x(),
                     u: offset.x,
                     v: offset.y,
-                    part: 0,
                 }
             }
             Self::Solid(solid) => {
@@ -449,9 +450,9 @@ impl Shape {
                 let [right, up] = &solid.axes[part];
                 Surface {
                     normal: solid.planes[part].0,
+                    right: *right,
                     u: offset.dot(right),
                     v: offset.dot(up),
-                    part,
                 }
             }
         }
@@ -482,11 +483,12 @@ impl Shape {
 
 /// Longitude and latitude on a sphere, in metres at its equator.
 fn around(normal: Vector3<f64>, radius: f64) -> Surface {
+    let beside = normal.x.hypot(normal.y).max(1e-9);
     Surface {
         normal,
+        right: Vector3::new(-normal.y, normal.x, 0.0) / beside,
         u: normal.y.atan2(normal.x) * radius,
         v: normal.z.clamp(-1.0, 1.0).asin() * radius,
-        part: 0,
     }
 }
 
@@ -549,19 +551,21 @@ impl Frustum {
     fn surface(&self, point: &Point3<f64>, part: usize) -> Surface {
         let offset = point - self.base;
         let (x, y) = (offset.dot(&self.right), offset.dot(&self.forward));
-        let (u, v) = if part == 0 {
+        let normal = self.normal(point, part);
+        let (right, u, v) = if part == 0 {
             (
+                (self.forward * x - self.right * y) / x.hypot(y),
                 y.atan2(x) * 0.5 * (self.base_radius + self.top_radius),
                 offset.dot(&self.axis),
             )
         } else {
-            (x, y)
+            (self.right, x, y)
         };
         Surface {
-            normal: self.normal(point, part),
+            normal,
+            right,
             u,
             v,
-            part,
         }
     }
 }

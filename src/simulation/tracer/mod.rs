@@ -218,7 +218,7 @@ impl Tracer<'_> {
                 ray,
                 bounces: 0,
                 travelled: 0.0,
-                spread: 1.0 / camera.fx,
+                spread: cos / camera.fx,
                 twist,
                 few,
                 weight: 1.0,

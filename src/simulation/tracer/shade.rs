@@ -20,6 +20,8 @@ const MAX_BOUNCES: u32 = 9;
 const FAINT: f32 = 0.045;
 /// Fewer points of a pattern are evaluated one by one.
 const FEW: usize = 3;
+/// Views more oblique than this (square of the cosine) count as this oblique.
+const LEAST_COS2: f64 = 2e-3;
 
 /// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
 /// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
@@ -132,11 +134,16 @@ impl Tracer<'_> {
             (surface.normal, cos)
         };
         let travelled = path.travelled + hit.crossing.t;
+        // Along a direction on the surface, a pixel's oblique print is as wide as the pixel, over the cosine of the angle
+        // that the ray makes with the plane across that direction.
+        let width = travelled * path.spread;
+        let along = path.ray.direction.dot(&surface.right).powi(2);
+        let cos2 = (cos * cos).max(LEAST_COS2);
+        let up = (1.0 - cos * cos - along).max(0.0);
         let spot = Spot {
             u: surface.u as f32,
             v: surface.v as f32,
-            // Between the short and the long side of the pixel's oblique print.
-            footprint: (travelled * path.spread / cos.max(0.1).sqrt()) as f32,
+            footprint: [along, up].map(|square| (width * (1.0 + square / cos2).sqrt()) as f32),
         };
         (normal, cos, spot)
     }
