@@ -3,25 +3,24 @@
 //! In: a point on a surface. Out: two shares, 0..1. Both are sampled; a tile looks for them at as few of its points as
 //! their differences allow.
 
+use std::sync::LazyLock;
+
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::{
-    LIFT, Path, Scratch, Seen, Tracer,
+    Path, Scratch, Seen, Tracer,
     tiles::{TILE, Tile},
 };
 use crate::{
+    isa::for_each_isa,
+    lanes::{LANES, Lanes},
     model::{camera::Intrinsics, pose::Pose},
     simulation::{
-        scene::{Hit, Light},
-        shapes::{Bounds, Ray},
+        scene::{Hit, Light, Scene},
+        shapes::{Bounds, Directions},
     },
 };
 
-const LAMP_SAMPLES: usize = 9;
-const SKY_SAMPLES: usize = 5;
-/// Where a sample is one of several of a pixel.
-const FEW_LAMP_SAMPLES: usize = 4;
-const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
@@ -146,20 +145,96 @@ const SHADOW_EDGE: f32 = 0.15;
 /// Shares of the lamp and of the sky that differ by less, across a tile, are looked for at few of its points.
 const LEVEL: [f32; 2] = [0.12, 0.16];
 
-/// Points spread evenly over the unit disc: a sunflower's seeds, turned by `twist` of a full turn.
-fn seed_points<const N: usize>(twist: f64) -> [(f64, f64); N] {
+/// Points spread evenly over the unit disc, x and y: a sunflower's seeds. They are the same everywhere, so that shadows
+/// belong to the world, not to whoever looks.
+static SEEDS: LazyLock<[Lanes; 2]> = LazyLock::new(|| {
     const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
-    let (step_sin, step_cos) = GOLDEN_ANGLE.sin_cos();
-    let (mut sin, mut cos) = (twist * std::f64::consts::TAU).sin_cos();
-    std::array::from_fn(|index| {
-        let radius = ((index as f64 + 0.5) / N as f64).sqrt();
-        let point = (radius * cos, radius * sin);
-        (sin, cos) = (
-            sin * step_cos + cos * step_sin,
-            cos * step_cos - sin * step_sin,
-        );
-        point
-    })
+    let polar = |index: usize| {
+        let radius = ((index as f64 + 0.5) / LANES as f64).sqrt();
+        (radius, index as f64 * GOLDEN_ANGLE)
+    };
+    let place = |of: fn(f64) -> f64| {
+        std::array::from_fn(|index| {
+            let (radius, angle) = polar(index);
+            (radius * of(angle)) as f32
+        })
+    };
+    [place(f64::cos), place(f64::sin)]
+});
+
+for_each_isa! {
+    /// Share of the lamp that these primitives leave to a point; `rays` lead from there to places on the lamp.
+    fn lamp_left(scene: &Scene, casters: &[u32], point: &Point3<f64>, rays: &Directions, share: &mut f32) = lamp_left_kernel;
+}
+
+#[inline(always)]
+fn lamp_left_kernel(
+    scene: &Scene,
+    casters: &[u32],
+    point: &Point3<f64>,
+    rays: &Directions,
+    share: &mut f32,
+) {
+    let mut left = [1.0; LANES];
+    for &caster in casters {
+        let primitive = &scene.primitives()[caster as usize];
+        let mut nearest = [1.0; LANES];
+        primitive.shape.approach(point, rays, &mut nearest);
+        let passed = if primitive.is_glass() {
+            GLASS_SHADOW
+        } else {
+            0.0
+        };
+        for lane in 0..LANES {
+            left[lane] *= if nearest[lane] < 1.0 { passed } else { 1.0 };
+        }
+        if left == [0.0; LANES] {
+            break;
+        }
+    }
+    *share = left.iter().sum::<f32>() / LANES as f32;
+}
+
+for_each_isa! {
+    /// Share of the sky that these primitives leave to a point, as near as [`SKY_REACH`] in the directions of `rays`, of
+    /// unit length.
+    fn sky_left(scene: &Scene, casters: &[u32], point: &Point3<f64>, rays: &Directions, share: &mut f32) = sky_left_kernel;
+}
+
+#[inline(always)]
+fn sky_left_kernel(
+    scene: &Scene,
+    casters: &[u32],
+    point: &Point3<f64>,
+    rays: &Directions,
+    share: &mut f32,
+) {
+    let mut nearest = [SKY_REACH as f32; LANES];
+    for &caster in casters {
+        scene.primitives()[caster as usize]
+            .shape
+            .approach(point, rays, &mut nearest);
+    }
+    let hidden = 1.0 - nearest.iter().sum::<f32>() / (SKY_REACH as f32 * LANES as f32);
+    *share = 1.0 - 0.9 * hidden;
+}
+
+/// Rays towards [`SEEDS`] on the disc that `right` and `forward` span, and `middle` farther.
+#[inline(always)]
+fn fan(
+    right: Vector3<f32>,
+    forward: Vector3<f32>,
+    middle: impl Fn(usize) -> Vector3<f32>,
+) -> Directions {
+    let mut rays = [[0.0; LANES]; 3];
+    let [xs, ys] = &*SEEDS;
+    for lane in 0..LANES {
+        let ray = middle(lane) + right * xs[lane] + forward * ys[lane];
+        for axis in 0..3 {
+            rays[axis][lane] = ray[axis];
+        }
+    }
+    rays
 }
 
 fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
@@ -408,21 +483,11 @@ impl Tracer<'_> {
         let facing = path.ray.direction.dot(&outward) < 0.0;
         let normal = if facing { outward } else { -outward };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
-        let sky = if path.few {
-            Self::sky_share::<FEW_SKY_SAMPLES>
-        } else {
-            Self::sky_share::<SKY_SAMPLES>
-        };
-        let lamp = if path.few {
-            Self::lamp_share::<FEW_LAMP_SAMPLES>
-        } else {
-            Self::lamp_share::<LAMP_SAMPLES>
-        };
         Lit {
             face: face_of(hit),
-            sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
+            sky: self.sky_share(&point, &normal, own, tile, scratch),
             lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
-                lamp(self, &point, own, path.twist, tile, scratch)
+                self.lamp_share(&point, own, tile, scratch)
             } else {
                 0.0
             },
@@ -455,12 +520,11 @@ impl Tracer<'_> {
     }
 
     /// Share of the sky that near things leave to the point, 0..1.
-    fn sky_share<const SAMPLES: usize>(
+    fn sky_share(
         &self,
         point: &Point3<f64>,
         normal: &Vector3<f64>,
         own: Option<u32>,
-        twist: f64,
         tile: Option<&Tile>,
         scratch: &mut Scratch,
     ) -> f32 {
@@ -476,32 +540,28 @@ impl Tracer<'_> {
             return 1.0;
         }
         let (right, forward) = basis(normal);
-        let mut hidden = 0.0;
-        for (x, y) in seed_points::<SAMPLES>(twist) {
-            let direction =
-                right * x + forward * y + normal * (1.0 - x * x - y * y).max(0.0).sqrt();
-            let ray = Ray {
-                origin: *point,
-                direction,
-            };
-            let mut nearest = SKY_REACH;
-            for &caster in &scratch.casters {
-                let primitive = &self.scene.primitives()[caster as usize];
-                if let Some(crossing) = primitive.shape.crossing(&ray, LIFT, nearest) {
-                    nearest = crossing.t;
-                }
-            }
-            hidden += 1.0 - (nearest / SKY_REACH) as f32;
-        }
-        1.0 - 0.9 * hidden / SAMPLES as f32
+        let [xs, ys] = &*SEEDS;
+        let rays = fan(right.cast(), forward.cast(), |lane| {
+            let (x, y) = (xs[lane], ys[lane]);
+            normal.cast() * (1.0 - x * x - y * y).sqrt()
+        });
+        let mut share = 1.0;
+        sky_left(
+            scratch.isa,
+            self.scene,
+            &scratch.casters,
+            point,
+            &rays,
+            &mut share,
+        );
+        share
     }
 
     /// Share of the lamp that the point sees, 0..1.
-    fn lamp_share<const SAMPLES: usize>(
+    fn lamp_share(
         &self,
         point: &Point3<f64>,
         own: Option<u32>,
-        twist: f64,
         tile: Option<&Tile>,
         scratch: &mut Scratch,
     ) -> f32 {
@@ -517,30 +577,18 @@ impl Tracer<'_> {
             return 1.0;
         }
         let (right, forward) = basis(&direction);
-        let mut seen = 0.0;
-        for (x, y) in seed_points::<SAMPLES>(twist) {
-            let offset = axis + (right * x + forward * y) * lamp.radius;
-            let distance = offset.norm();
-            let ray = Ray {
-                origin: *point,
-                direction: offset / distance,
-            };
-            let mut share = 1.0;
-            for &caster in &scratch.casters {
-                let primitive = &self.scene.primitives()[caster as usize];
-                if primitive.shape.crossing(&ray, LIFT, distance).is_some() {
-                    share *= if primitive.is_glass() {
-                        GLASS_SHADOW
-                    } else {
-                        0.0
-                    };
-                    if share == 0.0 {
-                        break;
-                    }
-                }
-            }
-            seen += share;
-        }
-        seen / SAMPLES as f32
+        let scaled = |vector: Vector3<f64>| (vector * lamp.radius).cast();
+        let axis: Vector3<f32> = axis.cast();
+        let rays = fan(scaled(right), scaled(forward), |_| axis);
+        let mut share = 1.0;
+        lamp_left(
+            scratch.isa,
+            self.scene,
+            &scratch.casters,
+            point,
+            &rays,
+            &mut share,
+        );
+        share
     }
 }

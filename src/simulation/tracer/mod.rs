@@ -100,14 +100,26 @@ pub struct Tracer<'a> {
 }
 
 /// Reused per tile.
-#[derive(Default)]
 struct Scratch {
+    isa: Isa,
     casters: Vec<u32>,
     paints: Vec<Option<Paint>>,
     seen: Vec<Seen>,
     /// Light on what is seen in mirrors and through glass, by face and place; of one row, or band, of pixels, so that it
     /// does not depend on which of them a thread takes.
     beyond: HashMap<(Face, [i32; 3]), Lit>,
+}
+
+impl Scratch {
+    fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            casters: Vec::new(),
+            paints: Vec::new(),
+            seen: Vec::new(),
+            beyond: HashMap::new(),
+        }
+    }
 }
 
 /// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
@@ -122,10 +134,6 @@ struct Path {
     travelled: f64,
     /// Pixel width, radians.
     spread: f64,
-    /// Turns the sample patterns, 0..1.
-    twist: f64,
-    /// One of several samples of its pixel.
-    few: bool,
     /// Its part in the pixel, 0..1.
     weight: f32,
 }
@@ -180,13 +188,6 @@ pub fn camera_ray(camera: &Intrinsics, world_from_camera: &Pose, u: f64, v: f64)
     Eye::new(camera, world_from_camera).ray(u, v)
 }
 
-/// A number in 0..1 that differs between neighbouring pixels like noise.
-fn twist_of(column: usize, row: usize) -> f64 {
-    // Jimenez's interleaved gradient noise. Without SSE4.1, `f64::fract` is a call into the C library.
-    let fraction = |x: f64| x - (x as i32 as f64);
-    fraction(52.982_918_9 * fraction(0.067_110_56 * column as f64 + 0.005_837_15 * row as f64))
-}
-
 impl Tracer<'_> {
     /// Renders what a camera sees.
     pub fn render(&self, camera: &Intrinsics, world_from_camera: &Pose) -> Rendering {
@@ -212,15 +213,13 @@ impl Tracer<'_> {
         };
         let mut lit = vec![UNLIT; pixels];
         let eye = Eye::new(camera, world_from_camera);
-        let path = |u: f64, v: f64, twist: f64, few: bool| {
+        let path = |u: f64, v: f64| {
             let (ray, cos) = eye.ray(u, v);
             let path = Path {
                 ray,
                 bounces: 0,
                 travelled: 0.0,
                 spread: cos / camera.fx,
-                twist,
-                few,
                 weight: 1.0,
             };
             (path, cos)
@@ -234,7 +233,7 @@ impl Tracer<'_> {
             .zip(lit.par_chunks_mut(width * TILE))
             .enumerate()
             .map_init(
-                Scratch::default,
+                || Scratch::new(isa),
                 |scratch, (band, ((((radiance, depth), through), object), lit))| {
                     scratch.beyond.clear();
                     let top = band * TILE;
@@ -265,7 +264,7 @@ impl Tracer<'_> {
                         for row in 0..height {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
-                                let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
+                                let (path, cos) = path(u as f64, v as f64);
                                 seen.push((row * width + column, path, cos, None));
                             }
                         }
@@ -324,70 +323,73 @@ impl Tracer<'_> {
             .radiance
             .par_chunks_mut(width)
             .enumerate()
-            .for_each_init(Scratch::default, |scratch, (row, radiance)| {
-                scratch.beyond.clear();
-                for (column, radiance) in radiance.iter_mut().enumerate() {
-                    let more = more_samples(camera, &rendering.object, lit, &first, column, row);
-                    if more == 0 {
-                        continue;
-                    }
-                    let here = row * width + column;
-                    let around = [
-                        Some(here),
-                        (column > 0).then(|| here - 1),
-                        (column + 1 < width).then_some(here + 1),
-                        (row > 0).then(|| here.wrapping_sub(width)),
-                        (row + 1 < camera.height).then_some(here + width),
-                    ];
-                    let tile = &bands[row / TILE][column / TILE];
-                    let clear = around
-                        .into_iter()
-                        .flatten()
-                        .all(|there| lit[there].face != UNLIT.face);
-                    let mut nearby = ArrayVec::<usize, 5>::new();
-                    for at in around.into_iter().flatten() {
-                        let primitive = lit[at].face.0 as usize;
-                        if !nearby.contains(&primitive) {
-                            nearby.push(primitive);
+            .for_each_init(
+                || Scratch::new(isa),
+                |scratch, (row, radiance)| {
+                    scratch.beyond.clear();
+                    for (column, radiance) in radiance.iter_mut().enumerate() {
+                        let more =
+                            more_samples(camera, &rendering.object, lit, &first, column, row);
+                        if more == 0 {
+                            continue;
                         }
-                    }
-                    // Glass is looked through again for every sample.
-                    let offsets = &SAMPLES[..if clear { more } else { 2 }];
-                    let share = 1.0 / (offsets.len() + 1) as f32;
-                    let mut sum = scaled(*radiance, share);
-                    for (index, &(du, dv)) in offsets.iter().enumerate() {
-                        let twist = twist_of(column, row) + index as f64 * 0.23;
-                        let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
-                        // Where there is no glass, what is seen here is seen at one of these pixels.
-                        let hit = if clear {
-                            self.first_of(&path.ray, &nearby)
-                        } else {
-                            None
+                        let here = row * width + column;
+                        let around = [
+                            Some(here),
+                            (column > 0).then(|| here - 1),
+                            (column + 1 < width).then_some(here + 1),
+                            (row > 0).then(|| here.wrapping_sub(width)),
+                            (row + 1 < camera.height).then_some(here + width),
+                        ];
+                        let tile = &bands[row / TILE][column / TILE];
+                        let clear = around
+                            .into_iter()
+                            .flatten()
+                            .all(|there| lit[there].face != UNLIT.face);
+                        let mut nearby = ArrayVec::<usize, 5>::new();
+                        for at in around.into_iter().flatten() {
+                            let primitive = lit[at].face.0 as usize;
+                            if !nearby.contains(&primitive) {
+                                nearby.push(primitive);
+                            }
                         }
-                        .or_else(|| self.first(&path.ray, tile, column, row));
-                        // What the pixel or one beside it shows of the same face: its texture and light are averaged
-                        // over a pixel already, and do not differ much.
-                        let known = hit.and_then(|hit| {
-                            around
-                                .into_iter()
-                                .flatten()
-                                .find(|&there| lit[there].face == face_of(&hit))
-                        });
-                        let near = Near {
-                            lit: None,
-                            view: Some(&view),
-                            tile: Some(tile),
-                            paint: None,
-                        };
-                        let colour = known.map_or_else(
-                            || self.shade(&path, hit.as_ref(), near, scratch),
-                            |there| first[there],
-                        );
-                        sum = plus(sum, scaled(colour, share));
+                        // Glass is looked through again for every sample.
+                        let offsets = &SAMPLES[..if clear { more } else { 2 }];
+                        let share = 1.0 / (offsets.len() + 1) as f32;
+                        let mut sum = scaled(*radiance, share);
+                        for &(du, dv) in offsets {
+                            let (path, _) = path(column as f64 + du, row as f64 + dv);
+                            // Where there is no glass, what is seen here is seen at one of these pixels.
+                            let hit = if clear {
+                                self.first_of(&path.ray, &nearby)
+                            } else {
+                                None
+                            }
+                            .or_else(|| self.first(&path.ray, tile, column, row));
+                            // What the pixel or one beside it shows of the same face: its texture and light are averaged
+                            // over a pixel already, and do not differ much.
+                            let known = hit.and_then(|hit| {
+                                around
+                                    .into_iter()
+                                    .flatten()
+                                    .find(|&there| lit[there].face == face_of(&hit))
+                            });
+                            let near = Near {
+                                lit: None,
+                                view: Some(&view),
+                                tile: Some(tile),
+                                paint: None,
+                            };
+                            let colour = known.map_or_else(
+                                || self.shade(&path, hit.as_ref(), near, scratch),
+                                |there| first[there],
+                            );
+                            sum = plus(sum, scaled(colour, share));
+                        }
+                        *radiance = sum;
                     }
-                    *radiance = sum;
-                }
-            });
+                },
+            );
         (rendering, view)
     }
 }

@@ -3,7 +3,11 @@
 //! Metres, world coordinates, z up. Double precision: depth is used as ground truth. Every shape but a [`Frustum`] seen
 //! from inside is convex, so a shape cannot shade itself.
 
+mod packet;
+
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+
+pub use self::packet::Directions;
 
 /// Half a line; `direction` has unit length.
 #[derive(Debug, Clone, Copy)]

@@ -1,0 +1,239 @@
+//! Whether, and where, rays from one point meet a shape: many rays at once, in single precision, for light. What is
+//! known of the point alone is taken in double precision, so that a point on a surface is on it.
+
+use nalgebra::{Point3, Vector3};
+
+use super::{Disc, Frustum, Shape, Solid};
+use crate::lanes::{LANES, Lanes};
+
+/// Directions of rays, of any length: x, y, z.
+pub type Directions = [Lanes; 3];
+
+/// Nearer crossings, in lengths of the direction, are the surface that a ray leaves.
+const LIFT: f32 = 1e-6;
+
+#[inline(always)]
+fn single(vector: &Vector3<f64>) -> [f32; 3] {
+    [vector.x as f32, vector.y as f32, vector.z as f32]
+}
+
+#[inline(always)]
+fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+fn least(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
+fn greatest(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+/// Both roots of `a t^2 + 2 b t + c`, the lesser first; meaningless where there is none, which comes third.
+#[inline(always)]
+fn roots(a: f32, b: f32, c: f32) -> (f32, f32, bool) {
+    let discriminant = b * b - a * c;
+    let root = greatest(discriminant, 0.0).sqrt();
+    let q = -(b + root.copysign(b));
+    let (one, two) = (q / a, c / q);
+    (
+        least(one, two),
+        greatest(one, two),
+        (discriminant >= 0.0) & (a != 0.0),
+    )
+}
+
+impl Shape {
+    /// Lessens `nearest`, in lengths of each direction, to where the ray from `origin` meets this shape.
+    #[inline(always)]
+    pub fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+        let [xs, ys, zs] = directions;
+        match self {
+            Self::Sphere(sphere) => {
+                let from_center = origin - sphere.center;
+                let beyond = from_center.norm_squared() - sphere.radius * sphere.radius;
+                round(single(&from_center), beyond as f32, directions, nearest);
+            }
+            Self::Ellipsoid(ellipsoid) => {
+                let from_center = ellipsoid.unit_from_world * (origin - ellipsoid.center);
+                let rows: [[f32; 3]; 3] = std::array::from_fn(|row| {
+                    single(&ellipsoid.unit_from_world.row(row).transpose())
+                });
+                let mut unit = [[0.0; LANES]; 3];
+                for (unit, row) in unit.iter_mut().zip(&rows) {
+                    for lane in 0..LANES {
+                        unit[lane] = dot(*row, [xs[lane], ys[lane], zs[lane]]);
+                    }
+                }
+                let beyond = from_center.norm_squared() - 1.0;
+                round(single(&from_center), beyond as f32, &unit, nearest);
+            }
+            Self::Frustum(frustum) => frustum.approach(origin, directions, nearest),
+            Self::Disc(disc) => disc.approach(origin, directions, nearest),
+            Self::Solid(solid) => solid.approach(origin, directions, nearest),
+        }
+    }
+}
+
+/// A sphere around the origin; `beyond`: of the point `from_center`, the square of its distance less that of the radius.
+#[inline(always)]
+fn round(from_center: [f32; 3], beyond: f32, directions: &Directions, nearest: &mut Lanes) {
+    let [xs, ys, zs] = directions;
+    for lane in 0..LANES {
+        let direction = [xs[lane], ys[lane], zs[lane]];
+        let (near, far, any) = roots(
+            dot(direction, direction),
+            dot(from_center, direction),
+            beyond,
+        );
+        let t = if near > LIFT { near } else { far };
+        let met = any & (t > LIFT) & (t < nearest[lane]);
+        nearest[lane] = if met { t } else { nearest[lane] };
+    }
+}
+
+impl Frustum {
+    #[inline(always)]
+    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+        let [xs, ys, zs] = directions;
+        let from_base = origin - self.base;
+        let height = from_base.dot(&self.axis);
+        let beside = from_base - self.axis * height;
+        let radius = self.base_radius + self.taper * height;
+        let beyond = (beside.norm_squared() - radius * radius) as f32;
+        let beside2 = beside.norm_squared() as f32;
+        let (axis, beside) = (single(&self.axis), single(&beside));
+        let (taper, length) = (self.taper as f32, self.height as f32);
+        let (radius, above, below) = (radius as f32, height as f32, (height - self.height) as f32);
+        let lids = [
+            (self.closed_base, above, self.base_radius),
+            (self.closed_top, below, self.top_radius),
+        ];
+        // Without lids: of the infinite cone between the two levels.
+        for lane in 0..LANES {
+            let direction = [xs[lane], ys[lane], zs[lane]];
+            let climb = dot(direction, axis);
+            let across = [
+                direction[0] - axis[0] * climb,
+                direction[1] - axis[1] * climb,
+                direction[2] - axis[2] * climb,
+            ];
+            let widening = taper * climb;
+            let (near, far, any) = roots(
+                dot(across, across) - widening * widening,
+                dot(beside, across) - radius * widening,
+                beyond,
+            );
+            let met = |t: f32| {
+                let level = above + t * climb;
+                any & (t > LIFT) & (t < nearest[lane]) & (level >= 0.0) & (level <= length)
+            };
+            let (first, second) = (met(near), met(far));
+            let t = if first { near } else { far };
+            nearest[lane] = if first | second { t } else { nearest[lane] };
+        }
+        for (closed, above, radius) in lids {
+            if !closed {
+                continue;
+            }
+            let radius2 = (radius * radius) as f32;
+            for lane in 0..LANES {
+                let direction = [xs[lane], ys[lane], zs[lane]];
+                let climb = dot(direction, axis);
+                let across = [
+                    direction[0] - axis[0] * climb,
+                    direction[1] - axis[1] * climb,
+                    direction[2] - axis[2] * climb,
+                ];
+                let t = -above / climb;
+                let aside2 = beside2 + t * (2.0 * dot(beside, across) + t * dot(across, across));
+                let met = (t > LIFT) & (t < nearest[lane]) & (aside2 <= radius2);
+                nearest[lane] = if met { t } else { nearest[lane] };
+            }
+        }
+    }
+}
+
+impl Disc {
+    #[inline(always)]
+    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+        let [xs, ys, zs] = directions;
+        let from_center = origin - self.center;
+        let above = self.normal.dot(&from_center) as f32;
+        let (normal, from_center) = (single(&self.normal), single(&from_center));
+        let (inner, outer) = (self.inner_radius as f32, self.radius as f32);
+        for lane in 0..LANES {
+            let direction = [xs[lane], ys[lane], zs[lane]];
+            // A parallel ray gives an infinite or undefined t, which fails.
+            let t = -above / dot(normal, direction);
+            let offset = [
+                from_center[0] + t * direction[0],
+                from_center[1] + t * direction[1],
+                from_center[2] + t * direction[2],
+            ];
+            let aside2 = dot(offset, offset);
+            let met = (t > LIFT)
+                & (t < nearest[lane])
+                & (aside2 <= outer * outer)
+                & (aside2 >= inner * inner);
+            nearest[lane] = if met { t } else { nearest[lane] };
+        }
+    }
+}
+
+impl Solid {
+    #[inline(always)]
+    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+        let [xs, ys, zs] = directions;
+        let (mut enter, mut leave) = ([f32::NEG_INFINITY; LANES], [f32::INFINITY; LANES]);
+        let (slabs, slopes) = self.planes.split_at(6);
+        // Of a parallel ray: so little that it is far inside or far outside.
+        let steep = |slope: f32| {
+            if slope.abs() < 1e-12 { 1e-12 } else { slope }
+        };
+        for planes in slabs.as_chunks::<2>().0 {
+            let [(normal, above), (_, below)] = planes;
+            let height = normal.dot(&origin.coords);
+            let (up, down) = ((above - height) as f32, (-below - height) as f32);
+            let normal = single(normal);
+            for lane in 0..LANES {
+                let slope = steep(dot(normal, [xs[lane], ys[lane], zs[lane]]));
+                let inverse = 1.0 / slope;
+                let (one, two) = (up * inverse, down * inverse);
+                enter[lane] = greatest(enter[lane], least(one, two));
+                leave[lane] = least(leave[lane], greatest(one, two));
+            }
+        }
+        for (normal, offset) in slopes {
+            let below = (offset - normal.dot(&origin.coords)) as f32;
+            let normal = single(normal);
+            for lane in 0..LANES {
+                let slope = steep(dot(normal, [xs[lane], ys[lane], zs[lane]]));
+                let t = below / slope;
+                let falling = slope < 0.0;
+                enter[lane] = if falling {
+                    greatest(enter[lane], t)
+                } else {
+                    enter[lane]
+                };
+                leave[lane] = if falling {
+                    leave[lane]
+                } else {
+                    least(leave[lane], t)
+                };
+            }
+        }
+        for lane in 0..LANES {
+            let t = if enter[lane] > LIFT {
+                enter[lane]
+            } else {
+                leave[lane]
+            };
+            let met = (enter[lane] <= leave[lane]) & (t > LIFT) & (t < nearest[lane]);
+            nearest[lane] = if met { t } else { nearest[lane] };
+        }
+    }
+}
