@@ -6,26 +6,27 @@
 //! One ray through each pixel's centre gives depth and object; edges and strong contrasts get more for colour. How
 //! much light a point gets does not depend on who looks: cameras side by side look for it once.
 
+mod edges;
 mod light;
 mod shade;
 mod tiles;
 
 use std::{collections::HashMap, ops::Range};
 
-use arrayvec::ArrayVec;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-pub use self::{light::LitView, shade::refracted};
 use self::{
-    light::{Face, Lit, UNLIT, face_of},
-    shade::{Paint, plus},
+    edges::{First, Samples},
+    light::{Face, Lit, UNLIT},
+    shade::Paint,
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
+pub use self::{light::LitView, shade::refracted};
 use super::{
     scene::{Finish, Hit, ObjectId, Primitive, Scene},
     shapes::{Bounds, Crossing, Ray, Shape},
-    texture::{Rgb, scaled},
+    texture::Rgb,
 };
 use crate::{
     isa::Isa,
@@ -34,12 +35,6 @@ use crate::{
 
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
-/// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
-const CONTRAST: f32 = 0.12;
-/// Where in such a pixel it is sampled again, besides its centre: five even steps both across and down, none off the
-/// middle. The first two do as well.
-const SAMPLES: [(f64, f64); 4] = [(0.4, -0.2), (-0.4, 0.2), (0.2, 0.4), (-0.2, -0.4)];
-
 /// A round lamp below the ceiling.
 #[derive(Debug, Clone)]
 pub struct Lamp {
@@ -125,6 +120,12 @@ impl Scratch {
 /// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
 type Seen = (usize, Path, f64, Option<Hit>);
 
+/// A row of tiles, and those of its pixels that mirror, or let light through.
+struct Band {
+    tiles: Vec<Tile>,
+    shiny: Vec<(usize, Path, Option<Hit>, Option<Paint>)>,
+}
+
 /// A ray on its way.
 #[derive(Clone, Copy)]
 struct Path {
@@ -158,6 +159,8 @@ struct Eye {
     corner: Vector3<f64>,
     across: Vector3<f64>,
     down: Vector3<f64>,
+    /// Width of a pixel at unit depth.
+    pixel: f64,
 }
 
 impl Eye {
@@ -168,12 +171,31 @@ impl Eye {
             corner: rotation * camera.unproject(0.0, 0.0, 1.0).coords,
             across: rotation * Vector3::new(1.0 / camera.fx, 0.0, 0.0),
             down: rotation * Vector3::new(0.0, 1.0 / camera.fy, 0.0),
+            pixel: 1.0 / camera.fx,
         }
+    }
+
+    /// Direction through image position `(u, v)`, of unit depth.
+    fn towards(&self, u: f64, v: f64) -> Vector3<f64> {
+        self.corner + self.across * u + self.down * v
+    }
+
+    /// [`Self::ray`] at its start.
+    fn path(&self, u: f64, v: f64) -> (Path, f64) {
+        let (ray, cos) = self.ray(u, v);
+        let path = Path {
+            ray,
+            bounces: 0,
+            travelled: 0.0,
+            spread: cos * self.pixel,
+            weight: 1.0,
+        };
+        (path, cos)
     }
 
     /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
     fn ray(&self, u: f64, v: f64) -> (Ray, f64) {
-        let direction = self.corner + self.across * u + self.down * v;
+        let direction = self.towards(u, v);
         let cos = direction.norm().recip();
         let ray = Ray {
             origin: self.origin,
@@ -213,18 +235,7 @@ impl Tracer<'_> {
         };
         let mut lit = vec![UNLIT; pixels];
         let eye = Eye::new(camera, world_from_camera);
-        let path = |u: f64, v: f64| {
-            let (ray, cos) = eye.ray(u, v);
-            let path = Path {
-                ray,
-                bounces: 0,
-                travelled: 0.0,
-                spread: cos / camera.fx,
-                weight: 1.0,
-            };
-            (path, cos)
-        };
-        let bands: Vec<Vec<Tile>> = rendering
+        let bands: Vec<Band> = rendering
             .radiance
             .par_chunks_mut(width * TILE)
             .zip(rendering.depth_m.par_chunks_mut(width * TILE))
@@ -244,6 +255,7 @@ impl Tracer<'_> {
                         .filter(|print| overlap(&print.window[1], &rows))
                         .collect();
                     let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
+                    let mut shiny = Vec::new();
                     for left in (0..width).step_by(TILE) {
                         let right = (left + TILE).min(width);
                         let frame = Pyramid::over(
@@ -264,7 +276,7 @@ impl Tracer<'_> {
                         for row in 0..height {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
-                                let (path, cos) = path(u as f64, v as f64);
+                                let (path, cos) = eye.path(u as f64, v as f64);
                                 seen.push((row * width + column, path, cos, None));
                             }
                         }
@@ -285,13 +297,7 @@ impl Tracer<'_> {
                                 object[at] = self.scene.primitives()[hit.primitive].object;
                                 continue;
                             }
-                            let near = Near {
-                                lit: Some(lit[at]),
-                                view: beside,
-                                tile: None,
-                                paint,
-                            };
-                            radiance[at] = self.shade(&path, hit.as_ref(), near, scratch);
+                            shiny.push((at, path, hit, paint));
                             let Some(hit) = hit else {
                                 continue;
                             };
@@ -312,13 +318,39 @@ impl Tracer<'_> {
                         scratch.seen = seen;
                         tiles.push(tile);
                     }
-                    tiles
+                    Band { tiles, shiny }
                 },
             )
             .collect();
-        let first = rendering.radiance.clone();
         let view = LitView::new(lit, rendering.depth_m.clone(), *camera, world_from_camera);
-        let lit = &view.lit;
+        rendering
+            .radiance
+            .par_chunks_mut(width * TILE)
+            .zip(&bands)
+            .enumerate()
+            .for_each_init(
+                || Scratch::new(isa),
+                |scratch, (number, (radiance, band))| {
+                    scratch.beyond.clear();
+                    for &(at, ref path, hit, paint) in &band.shiny {
+                        let near = Near {
+                            lit: Some(view.lit[number * width * TILE + at]),
+                            view: Some(&view),
+                            tile: Some(&band.tiles[at % width / TILE]),
+                            paint,
+                        };
+                        radiance[at] = self.shade(path, hit.as_ref(), near, scratch);
+                    }
+                },
+            );
+        let radiance = rendering.radiance.clone();
+        let first = First {
+            camera,
+            object: &rendering.object,
+            radiance: &radiance,
+            view: &view,
+        };
+        let samples = Samples::new(&eye);
         rendering
             .radiance
             .par_chunks_mut(width)
@@ -328,65 +360,11 @@ impl Tracer<'_> {
                 |scratch, (row, radiance)| {
                     scratch.beyond.clear();
                     for (column, radiance) in radiance.iter_mut().enumerate() {
-                        let more =
-                            more_samples(camera, &rendering.object, lit, &first, column, row);
-                        if more == 0 {
-                            continue;
+                        let tile = &bands[row / TILE].tiles[column / TILE];
+                        let place = (column, row);
+                        if let Some(mixed) = self.edge(&first, &samples, tile, place, scratch) {
+                            *radiance = mixed;
                         }
-                        let here = row * width + column;
-                        let around = [
-                            Some(here),
-                            (column > 0).then(|| here - 1),
-                            (column + 1 < width).then_some(here + 1),
-                            (row > 0).then(|| here.wrapping_sub(width)),
-                            (row + 1 < camera.height).then_some(here + width),
-                        ];
-                        let tile = &bands[row / TILE][column / TILE];
-                        let clear = around
-                            .into_iter()
-                            .flatten()
-                            .all(|there| lit[there].face != UNLIT.face);
-                        let mut nearby = ArrayVec::<usize, 5>::new();
-                        for at in around.into_iter().flatten() {
-                            let primitive = lit[at].face.0 as usize;
-                            if !nearby.contains(&primitive) {
-                                nearby.push(primitive);
-                            }
-                        }
-                        // Glass is looked through again for every sample.
-                        let offsets = &SAMPLES[..if clear { more } else { 2 }];
-                        let share = 1.0 / (offsets.len() + 1) as f32;
-                        let mut sum = scaled(*radiance, share);
-                        for &(du, dv) in offsets {
-                            let (path, _) = path(column as f64 + du, row as f64 + dv);
-                            // Where there is no glass, what is seen here is seen at one of these pixels.
-                            let hit = if clear {
-                                self.first_of(&path.ray, &nearby)
-                            } else {
-                                None
-                            }
-                            .or_else(|| self.first(&path.ray, tile, column, row));
-                            // What the pixel or one beside it shows of the same face: its texture and light are averaged
-                            // over a pixel already, and do not differ much.
-                            let known = hit.and_then(|hit| {
-                                around
-                                    .into_iter()
-                                    .flatten()
-                                    .find(|&there| lit[there].face == face_of(&hit))
-                            });
-                            let near = Near {
-                                lit: None,
-                                view: Some(&view),
-                                tile: Some(tile),
-                                paint: None,
-                            };
-                            let colour = known.map_or_else(
-                                || self.shade(&path, hit.as_ref(), near, scratch),
-                                |there| first[there],
-                            );
-                            sum = plus(sum, scaled(colour, share));
-                        }
-                        *radiance = sum;
                     }
                 },
             );
@@ -430,44 +408,6 @@ impl Tracer<'_> {
             }
         }
     }
-}
-
-/// How many more samples a pixel needs: none where it is like its neighbours, all of [`SAMPLES`] where one of them has
-/// another colour, two where one shows another object of about the same colour.
-fn more_samples(
-    camera: &Intrinsics,
-    object: &[ObjectId],
-    lit: &[Lit],
-    radiance: &[Rgb],
-    column: usize,
-    row: usize,
-) -> usize {
-    let width = camera.width;
-    let here = row * width + column;
-    let needed = |there: usize| {
-        // Textures are averaged over the pixel already; what is seen through glass is not.
-        if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
-            return 0;
-        }
-        let (a, b) = (radiance[here], radiance[there]);
-        let contrast = (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05));
-        match (contrast, object[here] != object[there]) {
-            (true, _) => SAMPLES.len(),
-            (false, true) => 2,
-            (false, false) => 0,
-        }
-    };
-    [
-        (column > 0).then(|| here - 1),
-        (column + 1 < width).then_some(here + 1),
-        (row > 0).then(|| here - width),
-        (row + 1 < camera.height).then_some(here + width),
-    ]
-    .into_iter()
-    .flatten()
-    .map(needed)
-    .max()
-    .unwrap_or(0)
 }
 
 /// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the
