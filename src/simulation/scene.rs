@@ -1,7 +1,7 @@
 //! What there is to see: shapes with materials, sorted into a tree of bounding boxes.
 
 use super::{
-    shapes::{Bounds, Crossing, Ray, Shape},
+    shapes::{Ball, Bounds, Crossing, Ray, Shape},
     texture::Pattern,
 };
 
@@ -90,6 +90,7 @@ pub struct Scene {
     primitives: Vec<Primitive>,
     /// Of each primitive.
     bounds: Vec<Bounds>,
+    balls: Vec<Ball>,
     /// Of each primitive: whether it may hide the lamp, and the sky.
     hides: Vec<[bool; 2]>,
     nodes: Vec<Node>,
@@ -107,27 +108,42 @@ struct Node {
     hides_sky: bool,
 }
 
-type Boxed = (Bounds, Primitive);
+/// What the tree needs to know of a primitive, and which it is.
+struct Boxed {
+    bounds: Bounds,
+    hides: [bool; 2],
+    index: usize,
+}
 
 const LEAF: usize = 2;
 
 impl Scene {
     pub fn new(primitives: Vec<Primitive>) -> Self {
         let mut boxed: Vec<Boxed> = primitives
-            .into_iter()
-            .map(|primitive| (primitive.shape.bounds(), primitive))
+            .iter()
+            .zip(0..)
+            .map(|(primitive, index)| Boxed {
+                bounds: primitive.shape.bounds(),
+                hides: [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)),
+                index,
+            })
             .collect();
         let mut nodes = Vec::with_capacity(boxed.len() * 2);
         if !boxed.is_empty() {
             build(&mut boxed, 0, &mut nodes);
         }
-        let (bounds, primitives): (_, Vec<_>) = boxed.into_iter().unzip();
+        let mut unsorted: Vec<_> = primitives.into_iter().map(Some).collect();
+        let primitives: Vec<_> = boxed
+            .iter()
+            .filter_map(|boxed| unsorted[boxed.index].take())
+            .collect();
         Self {
-            bounds,
-            hides: primitives
+            balls: primitives
                 .iter()
-                .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
+                .map(|primitive: &Primitive| primitive.shape.ball())
                 .collect(),
+            bounds: boxed.iter().map(|boxed| boxed.bounds).collect(),
+            hides: boxed.iter().map(|boxed| boxed.hides).collect(),
             primitives,
             nodes,
         }
@@ -140,6 +156,11 @@ impl Scene {
     /// Of each primitive.
     pub fn bounds(&self) -> &[Bounds] {
         &self.bounds
+    }
+
+    /// Of each primitive.
+    pub fn balls(&self) -> &[Ball] {
+        &self.balls
     }
 
     /// Of the primitives that `seen` allows.
@@ -237,7 +258,7 @@ impl Scene {
 fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
     let bounds = primitives
         .iter()
-        .fold(Bounds::EMPTY, |bounds, (own, _)| bounds.joined(own));
+        .fold(Bounds::EMPTY, |bounds, boxed| bounds.joined(&boxed.bounds));
     let index = nodes.len();
     nodes.push(Node {
         bounds,
@@ -246,10 +267,10 @@ fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
         axis: 0,
         hides_lamp: primitives
             .iter()
-            .any(|(_, primitive)| primitive.hides(Light::Lamp)),
+            .any(|boxed| boxed.hides[Light::Lamp as usize]),
         hides_sky: primitives
             .iter()
-            .any(|(_, primitive)| primitive.hides(Light::Sky)),
+            .any(|boxed| boxed.hides[Light::Sky as usize]),
     });
     if primitives.len() <= LEAF {
         return;
@@ -266,7 +287,7 @@ fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
 
 fn sort_along(primitives: &mut [Boxed], axis: usize) {
     // Twice the centre.
-    let place = |(bounds, _): &Boxed| bounds.min[axis] + bounds.max[axis];
+    let place = |boxed: &Boxed| boxed.bounds.min[axis] + boxed.bounds.max[axis];
     primitives.sort_by(|a, b| place(a).total_cmp(&place(b)));
 }
 
@@ -281,12 +302,12 @@ fn best_split(primitives: &mut [Boxed]) -> (usize, usize) {
         let mut above = vec![0.0; count];
         let mut bounds = Bounds::EMPTY;
         for index in (1..count).rev() {
-            bounds = bounds.joined(&primitives[index].0);
+            bounds = bounds.joined(&primitives[index].bounds);
             above[index] = bounds.surface() * (count - index) as f64;
         }
         let mut bounds = Bounds::EMPTY;
         for middle in 1..=count - least {
-            bounds = bounds.joined(&primitives[middle - 1].0);
+            bounds = bounds.joined(&primitives[middle - 1].bounds);
             let cost = bounds.surface() * middle as f64 + above[middle];
             if middle >= least && cost < best.0 {
                 best = (cost, axis, middle);

@@ -7,7 +7,7 @@ mod packet;
 
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
 
-pub use self::packet::Directions;
+pub use self::packet::{Directions, PLAIN, within};
 
 /// Half a line; `direction` has unit length.
 #[derive(Debug, Clone, Copy)]
@@ -66,6 +66,13 @@ impl Bounds {
         let size = self.max - self.min;
         2.0 * (size.x * size.y + size.y * size.z + size.z * size.x)
     }
+}
+
+/// A sphere that holds a shape.
+#[derive(Debug, Clone, Copy)]
+pub struct Ball {
+    pub center: Point3<f64>,
+    pub radius: f64,
 }
 
 /// Where a ray met a shape. `part` is the face: of a frustum 0 side, 1 base, 2 top; of a solid the number of its plane.
@@ -457,6 +464,26 @@ impl Shape {
                     right: *right,
                     u: offset.dot(right),
                     v: offset.dot(up),
+                }
+            }
+        }
+    }
+
+    pub fn ball(&self) -> Ball {
+        match self {
+            Self::Sphere(sphere) => Ball {
+                center: sphere.center,
+                radius: sphere.radius,
+            },
+            Self::Frustum(frustum) => Ball {
+                center: frustum.base + frustum.axis * (frustum.height * 0.5),
+                radius: (frustum.height * 0.5).hypot(frustum.base_radius.max(frustum.top_radius)),
+            },
+            _ => {
+                let bounds = self.bounds();
+                Ball {
+                    center: bounds.center(),
+                    radius: bounds.half().norm(),
                 }
             }
         }

@@ -4,13 +4,24 @@
 use nalgebra::{Point3, Vector3};
 
 use super::{Disc, Frustum, Shape, Solid};
-use crate::lanes::{LANES, Lanes};
+use crate::{
+    isa::for_each_isa,
+    lanes::{LANES, Lanes, bits},
+};
 
 /// Directions of rays, of any length: x, y, z.
 pub type Directions = [Lanes; 3];
 
 /// Nearer crossings, in lengths of the direction, are the surface that a ray leaves.
 const LIFT: f32 = 1e-6;
+/// Whether also what single precision cannot tell from met counts as met.
+pub type Caution = bool;
+pub const CAUTIOUS: Caution = true;
+pub const PLAIN: Caution = false;
+/// More than lengths and places are wrong in single precision, even where a ray only just meets a shape: metres.
+const SLACK: f32 = 2e-3;
+/// More than differences of squares are wrong, of the greater.
+const SQUARE_SLACK: f32 = 2e-5;
 
 #[inline(always)]
 fn single(vector: &Vector3<f64>) -> [f32; 3] {
@@ -32,9 +43,14 @@ fn greatest(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
+#[inline(always)]
+fn spare<const CAUTION: Caution>() -> f32 {
+    if CAUTION { SLACK } else { 0.0 }
+}
+
 /// Both roots of `a t^2 + 2 b t + c`, the lesser first; meaningless where there is none, which comes third.
 #[inline(always)]
-fn roots(a: f32, b: f32, c: f32) -> (f32, f32, bool) {
+fn roots<const CAUTION: Caution>(a: f32, b: f32, c: f32) -> (f32, f32, bool) {
     let discriminant = b * b - a * c;
     let root = greatest(discriminant, 0.0).sqrt();
     let q = -(b + root.copysign(b));
@@ -42,20 +58,46 @@ fn roots(a: f32, b: f32, c: f32) -> (f32, f32, bool) {
     (
         least(one, two),
         greatest(one, two),
-        (discriminant >= 0.0) & (a != 0.0),
+        (discriminant >= if CAUTION { -SQUARE_SLACK * b * b } else { 0.0 }) & (a != 0.0),
     )
+}
+
+for_each_isa! {
+    /// Bits of the lanes whose ray from `origin` may meet the shape nearer than `nearest`; no other does.
+    pub fn within(shape: &Shape, origin: &Point3<f64>, directions: &Directions, nearest: &Lanes, lanes: &mut u32) = within_kernel;
+}
+
+/// A root is no farther off than this, of itself.
+const ROOT_SLACK: f32 = 5e-3;
+
+#[inline(always)]
+fn within_kernel(
+    shape: &Shape,
+    origin: &Point3<f64>,
+    directions: &Directions,
+    nearest: &Lanes,
+    lanes: &mut u32,
+) {
+    let mut met = [f32::INFINITY; LANES];
+    shape.approach::<CAUTIOUS>(origin, directions, &mut met);
+    *lanes = bits(|lane| met[lane] * (1.0 - ROOT_SLACK) < nearest[lane]);
 }
 
 impl Shape {
     /// Lessens `nearest`, in lengths of each direction, to where the ray from `origin` meets this shape.
     #[inline(always)]
-    pub fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+    pub fn approach<const CAUTION: Caution>(
+        &self,
+        origin: &Point3<f64>,
+        directions: &Directions,
+        nearest: &mut Lanes,
+    ) {
         let [xs, ys, zs] = directions;
         match self {
             Self::Sphere(sphere) => {
                 let from_center = origin - sphere.center;
                 let beyond = from_center.norm_squared() - sphere.radius * sphere.radius;
-                round(single(&from_center), beyond as f32, directions, nearest);
+                round::<CAUTION>(single(&from_center), beyond as f32, directions, nearest);
             }
             Self::Ellipsoid(ellipsoid) => {
                 let from_center = ellipsoid.unit_from_world * (origin - ellipsoid.center);
@@ -69,22 +111,27 @@ impl Shape {
                     }
                 }
                 let beyond = from_center.norm_squared() - 1.0;
-                round(single(&from_center), beyond as f32, &unit, nearest);
+                round::<CAUTION>(single(&from_center), beyond as f32, &unit, nearest);
             }
-            Self::Frustum(frustum) => frustum.approach(origin, directions, nearest),
-            Self::Disc(disc) => disc.approach(origin, directions, nearest),
-            Self::Solid(solid) => solid.approach(origin, directions, nearest),
+            Self::Frustum(frustum) => frustum.approach::<CAUTION>(origin, directions, nearest),
+            Self::Disc(disc) => disc.approach::<CAUTION>(origin, directions, nearest),
+            Self::Solid(solid) => solid.approach::<CAUTION>(origin, directions, nearest),
         }
     }
 }
 
 /// A sphere around the origin; `beyond`: of the point `from_center`, the square of its distance less that of the radius.
 #[inline(always)]
-fn round(from_center: [f32; 3], beyond: f32, directions: &Directions, nearest: &mut Lanes) {
+fn round<const CAUTION: Caution>(
+    from_center: [f32; 3],
+    beyond: f32,
+    directions: &Directions,
+    nearest: &mut Lanes,
+) {
     let [xs, ys, zs] = directions;
     for lane in 0..LANES {
         let direction = [xs[lane], ys[lane], zs[lane]];
-        let (near, far, any) = roots(
+        let (near, far, any) = roots::<CAUTION>(
             dot(direction, direction),
             dot(from_center, direction),
             beyond,
@@ -97,7 +144,12 @@ fn round(from_center: [f32; 3], beyond: f32, directions: &Directions, nearest: &
 
 impl Frustum {
     #[inline(always)]
-    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+    fn approach<const CAUTION: Caution>(
+        &self,
+        origin: &Point3<f64>,
+        directions: &Directions,
+        nearest: &mut Lanes,
+    ) {
         let [xs, ys, zs] = directions;
         let from_base = origin - self.base;
         let height = from_base.dot(&self.axis);
@@ -112,6 +164,7 @@ impl Frustum {
             (self.closed_base, above, self.base_radius),
             (self.closed_top, below, self.top_radius),
         ];
+        let spare = spare::<CAUTION>();
         // Without lids: of the infinite cone between the two levels.
         for lane in 0..LANES {
             let direction = [xs[lane], ys[lane], zs[lane]];
@@ -122,14 +175,17 @@ impl Frustum {
                 direction[2] - axis[2] * climb,
             ];
             let widening = taper * climb;
-            let (near, far, any) = roots(
+            let (near, far, any) = roots::<CAUTION>(
                 dot(across, across) - widening * widening,
                 dot(beside, across) - radius * widening,
                 beyond,
             );
             let met = |t: f32| {
                 let level = above + t * climb;
-                any & (t > LIFT) & (t < nearest[lane]) & (level >= 0.0) & (level <= length)
+                any & (t > LIFT)
+                    & (t < nearest[lane])
+                    & (level >= -spare)
+                    & (level <= length + spare)
             };
             let (first, second) = (met(near), met(far));
             let t = if first { near } else { far };
@@ -139,7 +195,7 @@ impl Frustum {
             if !closed {
                 continue;
             }
-            let radius2 = (radius * radius) as f32;
+            let radius2 = (radius as f32 + spare) * (radius as f32 + spare);
             for lane in 0..LANES {
                 let direction = [xs[lane], ys[lane], zs[lane]];
                 let climb = dot(direction, axis);
@@ -159,12 +215,19 @@ impl Frustum {
 
 impl Disc {
     #[inline(always)]
-    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+    fn approach<const CAUTION: Caution>(
+        &self,
+        origin: &Point3<f64>,
+        directions: &Directions,
+        nearest: &mut Lanes,
+    ) {
         let [xs, ys, zs] = directions;
         let from_center = origin - self.center;
         let above = self.normal.dot(&from_center) as f32;
         let (normal, from_center) = (single(&self.normal), single(&from_center));
-        let (inner, outer) = (self.inner_radius as f32, self.radius as f32);
+        let spare = spare::<CAUTION>();
+        let (inner, outer) = (self.inner_radius as f32 - spare, self.radius as f32 + spare);
+        let (inner2, outer2) = (greatest(inner, 0.0) * inner, outer * outer);
         for lane in 0..LANES {
             let direction = [xs[lane], ys[lane], zs[lane]];
             // A parallel ray gives an infinite or undefined t, which fails.
@@ -175,10 +238,7 @@ impl Disc {
                 from_center[2] + t * direction[2],
             ];
             let aside2 = dot(offset, offset);
-            let met = (t > LIFT)
-                & (t < nearest[lane])
-                & (aside2 <= outer * outer)
-                & (aside2 >= inner * inner);
+            let met = (t > LIFT) & (t < nearest[lane]) & (aside2 <= outer2) & (aside2 >= inner2);
             nearest[lane] = if met { t } else { nearest[lane] };
         }
     }
@@ -186,7 +246,12 @@ impl Disc {
 
 impl Solid {
     #[inline(always)]
-    fn approach(&self, origin: &Point3<f64>, directions: &Directions, nearest: &mut Lanes) {
+    fn approach<const CAUTION: Caution>(
+        &self,
+        origin: &Point3<f64>,
+        directions: &Directions,
+        nearest: &mut Lanes,
+    ) {
         let [xs, ys, zs] = directions;
         let (mut enter, mut leave) = ([f32::NEG_INFINITY; LANES], [f32::INFINITY; LANES]);
         let (slabs, slopes) = self.planes.split_at(6);
@@ -226,13 +291,14 @@ impl Solid {
                 };
             }
         }
+        let spare = spare::<CAUTION>();
         for lane in 0..LANES {
             let t = if enter[lane] > LIFT {
                 enter[lane]
             } else {
                 leave[lane]
             };
-            let met = (enter[lane] <= leave[lane]) & (t > LIFT) & (t < nearest[lane]);
+            let met = (enter[lane] <= leave[lane] + spare) & (t > LIFT) & (t < nearest[lane]);
             nearest[lane] = if met { t } else { nearest[lane] };
         }
     }

@@ -15,7 +15,7 @@ use crate::{
     model::camera::Intrinsics,
     simulation::{
         scene::{ObjectId, Scene},
-        shapes::Directions,
+        shapes::{Directions, PLAIN},
         texture::{Rgb, scaled},
     },
 };
@@ -77,7 +77,7 @@ fn shown_kernel(
         let before = nearest;
         scene.primitives()[primitive]
             .shape
-            .approach(eye, rays, &mut nearest);
+            .approach::<PLAIN>(eye, rays, &mut nearest);
         for lane in 0..LANES {
             found[lane] = if nearest[lane] < before[lane] {
                 index
@@ -114,6 +114,20 @@ impl First<'_> {
         .collect()
     }
 
+    /// Whether a pixel inside the image shows a face that is not glass, and all around it the same.
+    fn is_amid(&self, column: usize, row: usize) -> bool {
+        let Intrinsics { width, height, .. } = *self.camera;
+        if column == 0 || column + 1 == width || row == 0 || row + 1 == height {
+            return false;
+        }
+        let here = row * width + column;
+        let face = self.lit(here).face;
+        face != UNLIT.face
+            && [here - width, here - 1, here + 1, here + width]
+                .into_iter()
+                .all(|there| self.lit(there).face == face)
+    }
+
     fn lit(&self, at: usize) -> &Lit {
         &self.view.lit[at]
     }
@@ -142,6 +156,9 @@ impl Tracer<'_> {
         (column, row): (usize, usize),
         scratch: &mut Scratch,
     ) -> Option<Rgb> {
+        if first.is_amid(column, row) {
+            return None;
+        }
         let around = first.around(column, row);
         if !first.is_edge(&around) {
             return None;

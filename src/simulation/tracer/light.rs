@@ -17,7 +17,7 @@ use crate::{
     model::{camera::Intrinsics, pose::Pose},
     simulation::{
         scene::{Hit, Light, Scene},
-        shapes::{Bounds, Directions},
+        shapes::{Ball, Bounds, Directions, PLAIN},
     },
 };
 
@@ -179,7 +179,7 @@ fn lamp_left_kernel(
     for &caster in casters {
         let primitive = &scene.primitives()[caster as usize];
         let mut nearest = [1.0; LANES];
-        primitive.shape.approach(point, rays, &mut nearest);
+        primitive.shape.approach::<PLAIN>(point, rays, &mut nearest);
         let passed = if primitive.is_glass() {
             GLASS_SHADOW
         } else {
@@ -213,7 +213,7 @@ fn sky_left_kernel(
     for &caster in casters {
         scene.primitives()[caster as usize]
             .shape
-            .approach(point, rays, &mut nearest);
+            .approach::<PLAIN>(point, rays, &mut nearest);
     }
     let hidden = 1.0 - nearest.iter().sum::<f32>() / (SKY_REACH as f32 * LANES as f32);
     *share = 1.0 - 0.9 * hidden;
@@ -502,6 +502,7 @@ impl Tracer<'_> {
         tile: Option<&Tile>,
         found: &mut Vec<u32>,
         may_hide: impl Fn(&Bounds) -> bool,
+        may_reach: impl Fn(&Ball) -> bool,
     ) {
         match tile.filter(|tile| tile.reach.contains(point)) {
             Some(tile) => {
@@ -512,7 +513,7 @@ impl Tracer<'_> {
                 found.clear();
                 found.extend(
                     list.iter()
-                        .filter(|&&index| may_hide(&self.scene.bounds()[index as usize])),
+                        .filter(|&&index| may_reach(&self.scene.balls()[index as usize])),
                 );
             }
             None => self.scene.casters(light, found, may_hide),
@@ -529,12 +530,19 @@ impl Tracer<'_> {
         scratch: &mut Scratch,
     ) -> f32 {
         let center = point + normal * (SKY_REACH * 0.5);
-        self.casters_at(Light::Sky, point, tile, &mut scratch.casters, |bounds| {
+        let may_hide = |bounds: &Bounds| {
             let nearest = center.sup(&bounds.min).inf(&bounds.max);
             (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
                 // Not wholly behind the surface.
                 && normal.dot(&(bounds.center() - point)) + normal.abs().dot(&bounds.half()) > 1e-3
-        });
+        };
+        let may_reach = |ball: &Ball| {
+            let offset = ball.center - point;
+            let reach = SKY_REACH + ball.radius;
+            offset.norm_squared() < reach * reach && normal.dot(&offset) + ball.radius > 1e-3
+        };
+        let casters = &mut scratch.casters;
+        self.casters_at(Light::Sky, point, tile, casters, may_hide, may_reach);
         scratch.casters.retain(|&index| Some(index) != own);
         if scratch.casters.is_empty() {
             return 1.0;
@@ -569,9 +577,17 @@ impl Tracer<'_> {
         let axis = lamp.center - point;
         let length = axis.norm();
         let direction = axis / length;
-        self.casters_at(Light::Lamp, point, tile, &mut scratch.casters, |bounds| {
-            in_beam(bounds, point, &direction, length, lamp.radius)
-        });
+        let may_hide = |bounds: &Bounds| in_beam(bounds, point, &direction, length, lamp.radius);
+        let may_reach = |ball: &Ball| {
+            let offset = ball.center - point;
+            let along = offset.dot(&direction);
+            let end = along + ball.radius;
+            // The beam is no wider there than at the ball's far end.
+            let reach = ball.radius + lamp.radius * (end / length).min(1.0);
+            end > 0.0 && offset.norm_squared() - along * along < reach * reach
+        };
+        let casters = &mut scratch.casters;
+        self.casters_at(Light::Lamp, point, tile, casters, may_hide, may_reach);
         scratch.casters.retain(|&index| Some(index) != own);
         if scratch.casters.is_empty() {
             return 1.0;

@@ -25,11 +25,12 @@ use self::{
 pub use self::{light::LitView, shade::refracted};
 use super::{
     scene::{Finish, Hit, ObjectId, Primitive, Scene},
-    shapes::{Bounds, Crossing, Ray, Shape},
+    shapes::{Bounds, Crossing, Ray, Shape, within},
     texture::Rgb,
 };
 use crate::{
     isa::Isa,
+    lanes::{LANES, members},
     model::{camera::Intrinsics, pose::Pose},
 };
 
@@ -280,7 +281,7 @@ impl Tracer<'_> {
                                 seen.push((row * width + column, path, cos, None));
                             }
                         }
-                        self.look(&tile, &mut seen, left..right, rows.clone());
+                        self.look(isa, &tile, &mut seen, left..right, rows.clone());
                         self.light(&mut tile, &seen, beside, lit, right - left, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
                         self.paint(isa, &seen, &mut paints);
@@ -374,7 +375,14 @@ impl Tracer<'_> {
 
 impl Tracer<'_> {
     /// Finds what each ray of a tile meets.
-    fn look(&self, tile: &Tile, seen: &mut [Seen], columns: Range<usize>, rows: Range<usize>) {
+    fn look(
+        &self,
+        isa: Isa,
+        tile: &Tile,
+        seen: &mut [Seen],
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
         let (across, last) = (columns.len(), seen.len() - 1);
         let flat = self.flat(
             tile,
@@ -401,9 +409,43 @@ impl Tracer<'_> {
                 }
             }
             None => {
-                let places = rows.flat_map(|row| columns.clone().map(move |column| (column, row)));
-                for ((_, path, _, met), (column, row)) in seen.iter_mut().zip(places) {
-                    *met = self.first(&path.ray, tile, column, row);
+                for group in seen.chunks_mut(LANES) {
+                    self.look_at_once(isa, tile, group);
+                }
+            }
+        }
+    }
+
+    /// As [`Self::first`] for at most [`LANES`] rays from one point.
+    fn look_at_once(&self, isa: Isa, tile: &Tile, group: &mut [Seen]) {
+        let ray = |lane: usize| &group[lane.min(group.len() - 1)].1.ray;
+        let origin = ray(0).origin;
+        let mut directions = [[0.0; LANES]; 3];
+        for lane in 0..LANES {
+            for axis in 0..3 {
+                directions[axis][lane] = ray(lane).direction[axis] as f32;
+            }
+        }
+        let mut nearest = [f32::INFINITY; LANES];
+        for print in &tile.seen {
+            let farthest = nearest[..group.len()].iter().copied().fold(0.0, f32::max);
+            if print.nearest_m > f64::from(farthest) {
+                break;
+            }
+            let shape = &self.scene.primitives()[print.primitive].shape;
+            let mut lanes = 0;
+            within(isa, shape, &origin, &directions, &nearest, &mut lanes);
+            for lane in members(lanes) {
+                let Some((_, path, _, met)) = group.get_mut(lane) else {
+                    break;
+                };
+                let t_max = met.map_or(f64::INFINITY, |hit| hit.crossing.t);
+                if let Some(crossing) = shape.crossing(&path.ray, LIFT, t_max) {
+                    nearest[lane] = crossing.t as f32;
+                    *met = Some(Hit {
+                        crossing,
+                        primitive: print.primitive,
+                    });
                 }
             }
         }
