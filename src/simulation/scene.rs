@@ -1,7 +1,8 @@
 //! What there is to see: shapes with materials, sorted into a tree of bounding boxes.
 
 use super::{
-    shapes::{Ball, Bounds, Crossing, Ray, Shape},
+    casters::Casters,
+    shapes::{Bounds, Crossing, Ray, Shape},
     texture::Pattern,
 };
 
@@ -90,9 +91,8 @@ pub struct Scene {
     primitives: Vec<Primitive>,
     /// Of each primitive.
     bounds: Vec<Bounds>,
-    balls: Vec<Ball>,
-    /// Of each primitive: whether it may hide the lamp, and the sky.
-    hides: Vec<[bool; 2]>,
+    /// Of the lamp, and of the sky.
+    casters: [Casters; 2],
     nodes: Vec<Node>,
 }
 
@@ -104,14 +104,11 @@ struct Node {
     count: u32,
     /// Branch: the left child lies lower along it.
     axis: u8,
-    hides_lamp: bool,
-    hides_sky: bool,
 }
 
 /// What the tree needs to know of a primitive, and which it is.
 struct Boxed {
     bounds: Bounds,
-    hides: [bool; 2],
     index: usize,
 }
 
@@ -124,7 +121,6 @@ impl Scene {
             .zip(0..)
             .map(|(primitive, index)| Boxed {
                 bounds: primitive.shape.bounds(),
-                hides: [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)),
                 index,
             })
             .collect();
@@ -138,12 +134,15 @@ impl Scene {
             .filter_map(|boxed| unsorted[boxed.index].take())
             .collect();
         Self {
-            balls: primitives
-                .iter()
-                .map(|primitive: &Primitive| primitive.shape.ball())
-                .collect(),
+            casters: [Light::Lamp, Light::Sky].map(|light| {
+                let casters = primitives.iter().zip(0..);
+                Casters::new(
+                    casters
+                        .filter(|(primitive, _)| primitive.hides(light))
+                        .map(|(primitive, index)| (index, primitive.shape.ball())),
+                )
+            }),
             bounds: boxed.iter().map(|boxed| boxed.bounds).collect(),
-            hides: boxed.iter().map(|boxed| boxed.hides).collect(),
             primitives,
             nodes,
         }
@@ -156,11 +155,6 @@ impl Scene {
     /// Of each primitive.
     pub fn bounds(&self) -> &[Bounds] {
         &self.bounds
-    }
-
-    /// Of each primitive.
-    pub fn balls(&self) -> &[Ball] {
-        &self.balls
     }
 
     /// Of the primitives that `seen` allows.
@@ -198,25 +192,9 @@ impl Scene {
         best
     }
 
-    /// Collects the primitives that may hide this light and whose bounds `may_hide` does not exclude.
-    pub fn casters(&self, light: Light, found: &mut Vec<u32>, may_hide: impl Fn(&Bounds) -> bool) {
-        found.clear();
-        self.walk(
-            |node, ()| {
-                let any = match light {
-                    Light::Lamp => node.hides_lamp,
-                    Light::Sky => node.hides_sky,
-                };
-                any && may_hide(&node.bounds)
-            },
-            |_| true,
-            &mut (),
-            |index, _| {
-                if self.hides[index][light as usize] && may_hide(&self.bounds[index]) {
-                    found.push(index as u32);
-                }
-            },
-        );
+    /// What may hide this light.
+    pub fn casters(&self, light: Light) -> &Casters {
+        &self.casters[light as usize]
     }
 
     fn walk<S: Copy>(
@@ -265,12 +243,6 @@ fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
         start: offset,
         count: primitives.len() as u32,
         axis: 0,
-        hides_lamp: primitives
-            .iter()
-            .any(|boxed| boxed.hides[Light::Lamp as usize]),
-        hides_sky: primitives
-            .iter()
-            .any(|boxed| boxed.hides[Light::Sky as usize]),
     });
     if primitives.len() <= LEAF {
         return;

@@ -168,7 +168,6 @@ impl Tracer<'_> {
         let near = Near {
             lit: None,
             view: Some(first.view),
-            tile: Some(tile),
             paint: None,
         };
         if around.iter().any(|&at| first.lit(at).face == UNLIT.face) {

@@ -12,10 +12,11 @@ use super::{
     tiles::{TILE, Tile},
 };
 use crate::{
-    isa::for_each_isa,
+    isa::{Isa, for_each_isa},
     lanes::{LANES, Lanes},
     model::{camera::Intrinsics, pose::Pose},
     simulation::{
+        casters::Beam,
         scene::{Hit, Light, Scene},
         shapes::{Ball, Bounds, Directions, PLAIN},
     },
@@ -316,7 +317,7 @@ fn in_beam(
 
 impl Tracer<'_> {
     /// Finds what may shade any of the points that a tile sees.
-    fn look_around(&self, tile: &mut Tile, seen: &[Seen]) {
+    fn look_around(&self, isa: Isa, tile: &mut Tile, seen: &[Seen]) {
         tile.reach = Bounds::of(
             seen.iter()
                 .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
@@ -334,15 +335,32 @@ impl Tracer<'_> {
         let axis = lamp.center - center;
         let length = axis.norm();
         let direction = axis / length;
-        self.scene.casters(Light::Lamp, &mut tile.lamp, |bounds| {
+        let beam = Beam {
+            from: center,
+            from_radius: half.norm(),
+            direction,
+            length,
+            lamp_radius: lamp.radius,
+        };
+        let bounds = |index: u32| &self.scene.bounds()[index as usize];
+        let casters = self.scene.casters(Light::Lamp);
+        casters.in_beam(isa, &beam, &mut tile.lamp);
+        tile.lamp.retain(|&index| {
             let grown = Bounds {
-                min: bounds.min - half,
-                max: bounds.max + half,
+                min: bounds(index).min - half,
+                max: bounds(index).max + half,
             };
             in_beam(&grown, &center, &direction, length, lamp.radius)
         });
-        self.scene.casters(Light::Sky, &mut tile.sky, |bounds| {
-            let apart = (bounds.center() - center).abs() - bounds.half() - half;
+        let about = Ball {
+            center,
+            radius: half.norm() + SKY_REACH,
+        };
+        self.scene
+            .casters(Light::Sky)
+            .near(isa, &about, &mut tile.sky);
+        tile.sky.retain(|&index| {
+            let apart = (bounds(index).center() - center).abs() - bounds(index).half() - half;
             apart.max() < SKY_REACH
         });
     }
@@ -384,7 +402,7 @@ impl Tracer<'_> {
                 return;
             }
         }
-        self.look_around(tile, seen);
+        self.look_around(scratch.isa, tile, seen);
         let tile = &*tile;
         if tile.lamp.is_empty() && tile.sky.is_empty() {
             for (at, path, _, hit) in seen {
@@ -413,8 +431,7 @@ impl Tracer<'_> {
                     _ => shared(&before, face, (column, row), 1, 1, [SHADOW_EDGE, 1.0])
                         .or_else(|| shared(&before, face, (column, row), 2, 3, LEVEL)),
                 };
-                let light =
-                    shared.unwrap_or_else(|| self.light_on(path, &hit, Some(tile), scratch));
+                let light = shared.unwrap_or_else(|| self.light_on(path, &hit, scratch));
                 known[row][column] = Some(light);
                 lit[at] = light;
             }
@@ -439,15 +456,9 @@ impl Tracer<'_> {
     }
 
     /// [`Self::light_on`] what is seen in a mirror or through glass. Points of a face that lie close together share it.
-    pub(super) fn light_beyond(
-        &self,
-        path: &Path,
-        hit: &Hit,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> Lit {
+    pub(super) fn light_beyond(&self, path: &Path, hit: &Hit, scratch: &mut Scratch) -> Lit {
         if path.bounces == 0 || path.weight < WEAK {
-            return self.light_on(path, hit, tile, scratch);
+            return self.light_on(path, hit, scratch);
         }
         let point = path.ray.at(hit.crossing.t);
         let cell = (point.coords / CELL_M).map(|x| x.floor() as i32);
@@ -455,18 +466,12 @@ impl Tracer<'_> {
         if let Some(lit) = scratch.beyond.get(&place) {
             return *lit;
         }
-        let lit = self.light_on(path, hit, tile, scratch);
+        let lit = self.light_on(path, hit, scratch);
         scratch.beyond.insert(place, lit);
         lit
     }
 
-    pub(super) fn light_on(
-        &self,
-        path: &Path,
-        hit: &Hit,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> Lit {
+    pub(super) fn light_on(&self, path: &Path, hit: &Hit, scratch: &mut Scratch) -> Lit {
         let primitive = &self.scene.primitives()[hit.primitive];
         if primitive.is_glass() {
             return UNLIT;
@@ -485,38 +490,12 @@ impl Tracer<'_> {
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
         Lit {
             face: face_of(hit),
-            sky: self.sky_share(&point, &normal, own, tile, scratch),
+            sky: self.sky_share(&point, &normal, own, scratch),
             lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
-                self.lamp_share(&point, own, tile, scratch)
+                self.lamp_share(&point, own, scratch)
             } else {
                 0.0
             },
-        }
-    }
-
-    /// What may hide a light from a point: from the tile's choice if the point is among those it was made for.
-    fn casters_at(
-        &self,
-        light: Light,
-        point: &Point3<f64>,
-        tile: Option<&Tile>,
-        found: &mut Vec<u32>,
-        may_hide: impl Fn(&Bounds) -> bool,
-        may_reach: impl Fn(&Ball) -> bool,
-    ) {
-        match tile.filter(|tile| tile.reach.contains(point)) {
-            Some(tile) => {
-                let list = match light {
-                    Light::Lamp => &tile.lamp,
-                    Light::Sky => &tile.sky,
-                };
-                found.clear();
-                found.extend(
-                    list.iter()
-                        .filter(|&&index| may_reach(&self.scene.balls()[index as usize])),
-                );
-            }
-            None => self.scene.casters(light, found, may_hide),
         }
     }
 
@@ -526,24 +505,25 @@ impl Tracer<'_> {
         point: &Point3<f64>,
         normal: &Vector3<f64>,
         own: Option<u32>,
-        tile: Option<&Tile>,
         scratch: &mut Scratch,
     ) -> f32 {
         let center = point + normal * (SKY_REACH * 0.5);
-        let may_hide = |bounds: &Bounds| {
-            let nearest = center.sup(&bounds.min).inf(&bounds.max);
-            (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
-                // Not wholly behind the surface.
-                && normal.dot(&(bounds.center() - point)) + normal.abs().dot(&bounds.half()) > 1e-3
-        };
-        let may_reach = |ball: &Ball| {
-            let offset = ball.center - point;
-            let reach = SKY_REACH + ball.radius;
-            offset.norm_squared() < reach * reach && normal.dot(&offset) + ball.radius > 1e-3
+        let about = Ball {
+            center,
+            radius: SKY_REACH * 0.9,
         };
         let casters = &mut scratch.casters;
-        self.casters_at(Light::Sky, point, tile, casters, may_hide, may_reach);
-        scratch.casters.retain(|&index| Some(index) != own);
+        self.scene
+            .casters(Light::Sky)
+            .near(scratch.isa, &about, casters);
+        casters.retain(|&index| {
+            let bounds = &self.scene.bounds()[index as usize];
+            let nearest = center.sup(&bounds.min).inf(&bounds.max);
+            Some(index) != own
+                && (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
+                // Not wholly behind the surface.
+                && normal.dot(&(bounds.center() - point)) + normal.abs().dot(&bounds.half()) > 1e-3
+        });
         if scratch.casters.is_empty() {
             return 1.0;
         }
@@ -566,29 +546,26 @@ impl Tracer<'_> {
     }
 
     /// Share of the lamp that the point sees, 0..1.
-    fn lamp_share(
-        &self,
-        point: &Point3<f64>,
-        own: Option<u32>,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> f32 {
+    fn lamp_share(&self, point: &Point3<f64>, own: Option<u32>, scratch: &mut Scratch) -> f32 {
         let lamp = &self.lighting.lamp;
         let axis = lamp.center - point;
         let length = axis.norm();
         let direction = axis / length;
-        let may_hide = |bounds: &Bounds| in_beam(bounds, point, &direction, length, lamp.radius);
-        let may_reach = |ball: &Ball| {
-            let offset = ball.center - point;
-            let along = offset.dot(&direction);
-            let end = along + ball.radius;
-            // The beam is no wider there than at the ball's far end.
-            let reach = ball.radius + lamp.radius * (end / length).min(1.0);
-            end > 0.0 && offset.norm_squared() - along * along < reach * reach
+        let beam = Beam {
+            from: *point,
+            from_radius: 0.0,
+            direction,
+            length,
+            lamp_radius: lamp.radius,
         };
         let casters = &mut scratch.casters;
-        self.casters_at(Light::Lamp, point, tile, casters, may_hide, may_reach);
-        scratch.casters.retain(|&index| Some(index) != own);
+        self.scene
+            .casters(Light::Lamp)
+            .in_beam(scratch.isa, &beam, casters);
+        casters.retain(|&index| {
+            let bounds = &self.scene.bounds()[index as usize];
+            Some(index) != own && in_beam(bounds, point, &direction, length, lamp.radius)
+        });
         if scratch.casters.is_empty() {
             return 1.0;
         }

@@ -147,8 +147,6 @@ struct Near<'a> {
     lit: Option<Lit>,
     /// The light that a camera near by sees.
     view: Option<&'a LitView>,
-    /// What may be in the light's way.
-    tile: Option<&'a Tile>,
     /// The surface itself.
     paint: Option<Paint>,
 }
@@ -337,7 +335,6 @@ impl Tracer<'_> {
                         let near = Near {
                             lit: Some(view.lit[number * width * TILE + at]),
                             view: Some(&view),
-                            tile: Some(&band.tiles[at % width / TILE]),
                             paint,
                         };
                         radiance[at] = self.shade(path, hit.as_ref(), near, scratch);

@@ -175,7 +175,7 @@ impl Tracer<'_> {
                 let lit = near
                     .lit
                     .or_else(|| near.view?.light_at(hit, &path.ray.at(hit.crossing.t)))
-                    .unwrap_or_else(|| self.light_beyond(path, hit, near.tile, scratch));
+                    .unwrap_or_else(|| self.light_beyond(path, hit, scratch));
                 self.opaque(path, hit, finish, lit, near, scratch)
             }
         }
