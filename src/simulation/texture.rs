@@ -250,17 +250,19 @@ fn stripes<const N: usize>(x: &[f32; N], footprint: &[f32; N], seed: u32) -> [f3
         (0.156, 0.161, 0.90),
         (0.186, 0.191, 0.40),
     ];
-    let mut strengths = [0.0f32; N];
+    let turn: [i32; N] = std::array::from_fn(|lane| floor(x[lane] * (1.0 / PERIOD)));
+    let inside = sums::<N>(|lane| x[lane] - turn[lane] as f32 * PERIOD);
+    // Of the footprint, covered.
+    let mut covered = [0.0f32; N];
     for (&(low, high, strength), line) in LINES.iter().zip(0..) {
         for lane in 0..N {
-            let turn = floor(x[lane] * (1.0 / PERIOD));
-            let inside = x[lane] - turn as f32 * PERIOD;
-            let shift = (hash(turn, line, seed) - 0.5) * 0.012;
-            let cover = between(inside, low + shift, high + shift, footprint[lane]);
-            strengths[lane] += strength * cover;
+            let shifted = inside[lane] - (hash(turn[lane], line, seed) - 0.5) * 0.012;
+            let reach = footprint[lane] * 0.5;
+            let common = (shifted + reach).min(high) - (shifted - reach).max(low);
+            covered[lane] += strength * common.max(0.0);
         }
     }
-    strengths.map(|strength| strength.min(1.0))
+    sums(|lane| (covered[lane] / footprint[lane]).min(1.0))
 }
 
 /// The complex number to this power.
@@ -327,15 +329,32 @@ impl Pattern {
                 let across = stripes(&sums(|i| v[i] + fold[i] * 0.0028 + 0.05), high, seed + 1);
                 let fine = clouds(u, v, EVEN, 0.02, 2, spots, seed + 2);
                 let broad = clouds(u, v, EVEN, 0.2, 1, spots, seed + 3);
-                of_each(spots, |lane, &Spot { u, v, footprint }| {
-                    let colour = mixed(
-                        mixed(*ground, *warp, along[lane] * 0.8),
-                        *weft,
-                        across[lane] * 0.62,
-                    );
-                    let colour = embroidered(colour, *warp, u, v, footprint, seed + 4);
-                    scaled(colour, 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane])
-                })
+                let dotted: [bool; N] = std::array::from_fn(|lane| {
+                    let (_, du, dv) = dot_by(u[lane], v[lane], seed + 4);
+                    let reach = DOT + wide[lane].max(high[lane]);
+                    du * du + dv * dv < reach * reach
+                });
+                let mut colours = [[0.0; 3]; N];
+                for channel in 0..3 {
+                    let [ground, warp, weft] = [ground, warp, weft].map(|yarn| yarn[channel]);
+                    for lane in 0..N {
+                        let woven = ground + (warp - ground) * along[lane] * 0.8;
+                        let woven = woven + (weft - woven) * across[lane] * 0.62;
+                        let light = 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane];
+                        colours[lane][channel] = woven * light;
+                    }
+                }
+                for lane in 0..N {
+                    if dotted[lane] {
+                        let light = 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane];
+                        let cloth = scaled(colours[lane], light.recip());
+                        let footprint = [wide[lane], high[lane]];
+                        let (u, v) = (u[lane], v[lane]);
+                        let dot = embroidered(cloth, *warp, u, v, footprint, seed + 4);
+                        colours[lane] = scaled(dot, light);
+                    }
+                }
+                colours
             }
             Self::Planks {
                 light,
@@ -445,30 +464,41 @@ fn towards([wide, high]: [f32; 2], u: f32, v: f32, length: f32) -> f32 {
     (u * u + v * v).sqrt() / length
 }
 
-/// Embroidered dots in some of the tartan's fields.
-fn embroidered(colour: Rgb, warp: Rgb, u: f32, v: f32, footprint: [f32; 2], seed: u32) -> Rgb {
-    let (i, j) = (floor(u / 0.07), floor(v / 0.07));
-    let chosen = hash(i, j, seed);
-    if chosen <= 0.55 {
-        return colour;
-    }
-    let du = u - (i as f32 + 0.3 + chosen * 0.4) * 0.07;
+/// Reach of the longest petals of an embroidered dot, metres.
+const DOT: f32 = 0.013;
+
+/// The embroidered dot in this one of the tartan's fields: which kind, 0..1, and the way to here from its heart; far away
+/// in a field that has none.
+#[inline(always)]
+fn dot_by(u: f32, v: f32, seed: u32) -> (f32, f32, f32) {
+    let (i, j) = (floor(u * (1.0 / 0.07)), floor(v * (1.0 / 0.07)));
+    let kind = hash(i, j, seed);
+    let du = u - (i as f32 + 0.3 + kind * 0.4) * 0.07;
     let dv = v - (j as f32 + 0.5) * 0.07;
-    let radius = (du * du + dv * dv).sqrt();
-    // Beyond its longest petals there is nothing of it.
-    if radius >= 0.013 + footprint[0].max(footprint[1]) {
-        return colour;
-    }
-    // The cosine of five times the angle.
-    let away = radius.max(1e-6);
-    let footprint = towards(footprint, du, dv, away);
-    let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
-    let figure = 1.0 - above(radius, petal, footprint);
-    let heart = 1.0 - above(radius, 0.004, footprint);
+    (kind, du, if kind > 0.55 { dv } else { 1.0 })
+}
+
+/// The cloth's colour with what an embroidered dot near by covers of the pixel.
+fn embroidered(cloth: Rgb, warp: Rgb, u: f32, v: f32, footprint: [f32; 2], seed: u32) -> Rgb {
     static YARNS: LazyLock<[Rgb; 2]> = LazyLock::new(|| [rgb(0xc98a2b), rgb(0xf4e3b0)]);
     let [gold, cream] = *YARNS;
-    let thread = mixed(warp, gold, f32::from(chosen > 0.78));
-    mixed(mixed(colour, thread, figure * 0.9), cream, heart)
+    let (kind, du, dv) = dot_by(u, v, seed);
+    let thread = mixed(warp, gold, f32::from(kind > 0.78));
+    // A dot is hardly larger than a pixel's print: by quarters.
+    let quarter = footprint.map(|side| side * 0.5);
+    let mut sum = [0.0; 3];
+    for (right, up) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
+        let (du, dv) = (du + right * footprint[0], dv + up * footprint[1]);
+        let away = (du * du + dv * dv).sqrt().max(1e-6);
+        let across = towards(quarter, du, dv, away);
+        // The cosine of five times the angle.
+        let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
+        let figure = 1.0 - above(away, petal, across);
+        let heart = 1.0 - above(away, 0.004, across);
+        let colour = mixed(mixed(cloth, thread, figure * 0.9), cream, heart);
+        sum = std::array::from_fn(|i| sum[i] + 0.25 * colour[i]);
+    }
+    sum
 }
 
 /// How much of the wallpaper's figure, a flower on a stalk, is at a place.
