@@ -41,8 +41,8 @@ pub struct Spot {
     pub footprint: [f32; 2],
 }
 
-/// Several places on surfaces of one pattern.
-struct Spots<const N: usize> {
+/// Several [`Spot`]s on surfaces of one pattern.
+pub struct Spots<const N: usize> {
     u: [f32; N],
     v: [f32; N],
     footprint: [[f32; N]; 2],
@@ -52,16 +52,23 @@ struct Spots<const N: usize> {
 
 impl<const N: usize> Spots<N> {
     #[inline(always)]
-    fn new(spots: &[Spot; N]) -> Self {
+    pub fn new(u: [f32; N], v: [f32; N], footprint: [[f32; N]; 2]) -> Self {
         Self {
-            u: spots.map(|spot| spot.u),
-            v: spots.map(|spot| spot.v),
-            footprint: [0, 1].map(|axis| spots.map(|spot| spot.footprint[axis])),
-            finest: [0, 1].map(|axis| {
-                let footprints = spots.iter().map(|spot| spot.footprint[axis]);
-                footprints.fold(f32::INFINITY, f32::min)
-            }),
+            u,
+            v,
+            finest: [0, 1]
+                .map(|axis: usize| footprint[axis].into_iter().fold(f32::INFINITY, f32::min)),
+            footprint,
         }
+    }
+
+    #[inline(always)]
+    fn of(spots: &[Spot; N]) -> Self {
+        Self::new(
+            spots.map(|spot| spot.u),
+            spots.map(|spot| spot.v),
+            [0, 1].map(|axis| spots.map(|spot| spot.footprint[axis])),
+        )
     }
 }
 
@@ -302,18 +309,19 @@ for_each_isa! {
 
 #[inline(always)]
 fn colours_kernel(pattern: &Pattern, spots: &[Spot; LANES], colours: &mut [Rgb; LANES]) {
-    *colours = pattern.colours(&Spots::new(spots));
+    *colours = pattern.colours(&Spots::of(spots));
 }
 
 impl Pattern {
     /// Linear RGB reflectance.
     pub fn colour(&self, spot: &Spot) -> Rgb {
-        let [colour] = self.colours(&Spots::new(&[*spot]));
+        let [colour] = self.colours(&Spots::of(&[*spot]));
         colour
     }
 
+    /// [`Self::colour`] at several places.
     #[inline(always)]
-    fn colours<const N: usize>(&self, spots: &Spots<N>) -> [Rgb; N] {
+    pub fn colours<const N: usize>(&self, spots: &Spots<N>) -> [Rgb; N] {
         let Spots { u, v, .. } = spots;
         match self {
             Self::Plain(colour) => [*colour; N],

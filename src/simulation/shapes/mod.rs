@@ -218,6 +218,11 @@ impl Solid {
         &self.planes
     }
 
+    /// Of a face: where its texture begins, and the directions in which u and v grow.
+    pub fn texture(&self, part: usize) -> (&Point3<f64>, &[Vector3<f64>; 2]) {
+        (&self.origin, &self.axes[part])
+    }
+
     /// Where a ray meets the plane of a face, metres along the ray.
     pub fn on_plane_of(&self, part: usize, ray: &Ray) -> f64 {
         let (normal, offset) = &self.planes[part];

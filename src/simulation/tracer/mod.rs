@@ -7,6 +7,7 @@
 //! much light a point gets does not depend on who looks: cameras side by side look for it once.
 
 mod edges;
+mod flat;
 mod light;
 mod shade;
 mod tiles;
@@ -282,8 +283,18 @@ impl Tracer<'_> {
                         self.look(isa, &tile, &mut seen, left..right, rows.clone());
                         self.light(&mut tile, &seen, beside, lit, right - left, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
-                        self.paint(isa, &seen, &mut paints);
-                        for (&(at, path, cos, hit), &paint) in seen.iter().zip(&paints) {
+                        let painted = self.paint_flat(isa, &seen, lit, radiance);
+                        self.paint(isa, &seen, painted, &mut paints);
+                        let pixels = seen.iter().zip(&paints).enumerate();
+                        for (index, (&(at, path, cos, hit), &paint)) in pixels {
+                            if let Some(hit) = hit
+                                && painted >> index & 1 == 1
+                            {
+                                depth[at] = (hit.crossing.t * cos) as f32;
+                                through[at] = depth[at];
+                                object[at] = self.scene.primitives()[hit.primitive].object;
+                                continue;
+                            }
                             let matte = hit.zip(paint).filter(|(hit, _)| {
                                 let material = &self.scene.primitives()[hit.primitive].material;
                                 material.finish == Finish::Matte

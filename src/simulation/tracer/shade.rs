@@ -21,7 +21,7 @@ const FAINT: f32 = 0.045;
 /// Fewer points of a pattern are evaluated one by one.
 const FEW: usize = 3;
 /// Views more oblique than this (square of the cosine) count as this oblique.
-const LEAST_COS2: f64 = 2e-3;
+pub(super) const LEAST_COS2: f64 = 2e-3;
 
 /// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
 /// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
@@ -66,8 +66,14 @@ pub(super) struct Paint {
 }
 
 impl Tracer<'_> {
-    /// The surface that each of a tile's rays meets. Its pattern is evaluated for many rays at once.
-    pub(super) fn paint(&self, isa: Isa, seen: &[Seen], paints: &mut Vec<Option<Paint>>) {
+    /// The surface that each of a tile's rays, but those `painted` already, meets. Its pattern is evaluated for many rays at once.
+    pub(super) fn paint(
+        &self,
+        isa: Isa,
+        seen: &[Seen],
+        painted: u64,
+        paints: &mut Vec<Option<Paint>>,
+    ) {
         paints.clear();
         let mut spots = [Spot::default(); TILE * TILE];
         // Which rays wait for their colour.
@@ -75,7 +81,7 @@ impl Tracer<'_> {
         for (index, (_, path, _, hit)) in seen.iter().enumerate() {
             let paint = hit.and_then(|hit| {
                 let primitive = &self.scene.primitives()[hit.primitive];
-                if primitive.is_glass() {
+                if primitive.is_glass() || painted >> index & 1 == 1 {
                     return None;
                 }
                 let (normal, cos, spot) = Self::spot(primitive, path, &hit);
@@ -256,17 +262,23 @@ impl Tracer<'_> {
         plus(through, scaled(reflected, share))
     }
 
+    /// The light on a surface from everywhere but the lamp.
+    pub(super) fn skylight(&self, normal: &Vector3<f64>) -> Rgb {
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        )
+    }
+
     /// The light that a surface scatters.
     #[inline]
     pub(super) fn diffuse(&self, point: &Point3<f64>, paint: &Paint, lit: Lit) -> Rgb {
         let normal = &paint.normal;
         let lighting = self.lighting;
-        let up = (0.5 + 0.5 * normal.z) as f32;
-        let (towards, window) = &lighting.window;
-        let sky = plus(
-            mixed(lighting.ground, lighting.sky, up),
-            scaled(*window, normal.dot(towards).max(0.0) as f32),
-        );
+        let sky = self.skylight(normal);
         let lamp = &lighting.lamp;
         let to_lamp = lamp.center - point;
         let distance = to_lamp.norm();
