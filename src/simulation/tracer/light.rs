@@ -55,12 +55,12 @@ pub struct LitView {
     depth_m: Vec<f32>,
     camera: Intrinsics,
     eye: Point3<f64>,
-    /// Of the world: turns and scales it to `(u, v, 1)` times depth.
-    pixels_from_world: Matrix3<f64>,
+    /// Of the world: turns and scales it to `(u, v, 1)` times depth; rows.
+    pixels_from_world: [Vector3<f64>; 3],
 }
 
 /// Depths that differ by more, relative to themselves, are not of one place on a face.
-const SAME_DEPTH: f64 = 0.03;
+const SAME_DEPTH: f32 = 0.03;
 /// Of the four pixels around a point, those that show its face must have so much of the weight.
 const ENOUGH: f32 = 0.2;
 
@@ -76,25 +76,29 @@ impl LitView {
             0.0, camera.fy, camera.cy, //
             0.0, 0.0, 1.0,
         );
+        let pixels_from_world =
+            pixels_from_camera * world_from_camera.rotation.inverse().to_rotation_matrix();
         Self {
             lit,
             depth_m,
             camera,
             eye: Point3::from(world_from_camera.translation.vector),
-            pixels_from_world: pixels_from_camera
-                * world_from_camera.rotation.inverse().to_rotation_matrix(),
+            pixels_from_world: [0, 1, 2].map(|row| pixels_from_world.row(row).transpose()),
         }
     }
 
     /// The light on a point, if the camera sees the place: from the pixels around it that show the same face.
     pub(super) fn light_at(&self, hit: &Hit, point: &Point3<f64>) -> Option<Lit> {
-        let scaled = self.pixels_from_world * (point - self.eye);
-        let depth_m = scaled.z;
+        let from_eye = point - self.eye;
+        let [u, v, depth_m] = self
+            .pixels_from_world
+            .each_ref()
+            .map(|row| row.x * from_eye.x + row.y * from_eye.y + row.z * from_eye.z);
         if depth_m <= 0.0 {
             return None;
         }
         let nearness = depth_m.recip();
-        let (u, v) = (scaled.x * nearness, scaled.y * nearness);
+        let (u, v) = (u * nearness, v * nearness);
         let Intrinsics { width, height, .. } = self.camera;
         // Also false for what is not a number.
         let inside = u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64;
@@ -105,31 +109,31 @@ impl LitView {
         let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
         let face = face_of(hit);
+        let depth_m = depth_m as f32;
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
+        let last = (column + 2).min(width);
         for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
             // Rectified cameras meet in whole rows.
             if along < 1e-4 || row >= height {
                 continue;
             }
-            for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
-                if column >= width {
-                    continue;
-                }
-                let near = across * along;
-                let at = row * width + column;
-                let lit = &self.lit[at];
-                let apart = (f64::from(self.depth_m[at]) - depth_m).abs();
-                if lit.face == face && apart < SAME_DEPTH * depth_m {
-                    weight += near;
-                    sky += near * lit.sky;
-                    lamp += near * lit.lamp;
-                }
+            let places = row * width + column..row * width + last;
+            let lits = self.lit[places.clone()].iter().zip(&self.depth_m[places]);
+            for ((lit, there_m), across) in lits.zip([1.0 - right, right]) {
+                let same = lit.face == face && (there_m - depth_m).abs() < SAME_DEPTH * depth_m;
+                let near = if same { across * along } else { 0.0 };
+                weight += near;
+                sky += near * lit.sky;
+                lamp += near * lit.lamp;
             }
         }
-        (weight > ENOUGH).then(|| Lit {
-            face,
-            sky: sky / weight,
-            lamp: lamp / weight,
+        (weight > ENOUGH).then(|| {
+            let share = weight.recip();
+            Lit {
+                face,
+                sky: sky * share,
+                lamp: lamp * share,
+            }
         })
     }
 }
