@@ -146,9 +146,9 @@ pub(super) const UNLIT: Lit = Lit {
 };
 
 /// Lamp shares that differ by more are the edge of a shadow, where each pixel is looked at.
-const SHADOW_EDGE: f32 = 0.15;
+const SHADOW_EDGE: f32 = 0.08;
 /// Shares of the lamp and of the sky that differ by less, across a tile, are looked for at few of its points.
-const LEVEL: [f32; 2] = [0.12, 0.16];
+const LEVEL: [f32; 2] = [0.06, 0.08];
 
 /// Points spread evenly over the unit disc, x and y: a sunflower's seeds. They are the same everywhere, so that shadows
 /// belong to the world, not to whoever looks.
@@ -250,6 +250,55 @@ fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     };
     let right = helper.cross(normal).normalize();
     (right, normal.cross(&right))
+}
+
+/// The coarsest lattice in a tile: the distance of its points, and the first.
+const COARSE: usize = 4;
+const MIDST: usize = 2;
+
+/// Light that hardly changes over a tile's face.
+struct Level([[Lit; 2]; 2]);
+
+impl Level {
+    /// Of the four points of the coarsest lattice, if they show one face and differ by less than [`LEVEL`].
+    fn between(known: &[[Option<Lit>; TILE]; TILE]) -> Option<Self> {
+        const THERE: usize = MIDST + COARSE;
+        let corners = [
+            [known[MIDST][MIDST]?, known[MIDST][THERE]?],
+            [known[THERE][MIDST]?, known[THERE][THERE]?],
+        ];
+        let all = corners.as_flattened();
+        let range = |of: fn(&Lit) -> f32| {
+            let least = all.iter().map(of).fold(f32::INFINITY, f32::min);
+            all.iter().map(of).fold(0.0, f32::max) - least
+        };
+        (all.iter().all(|lit| lit.face == all[0].face)
+            && range(|lit| lit.lamp) < LEVEL[0]
+            && range(|lit| lit.sky) < LEVEL[1])
+            .then_some(Self(corners))
+    }
+
+    fn face(&self) -> Face {
+        self.0[0][0].face
+    }
+
+    /// Linear in both directions, so that neighbouring tiles join.
+    fn at(&self, column: usize, row: usize) -> Lit {
+        let share = |i: usize| (i as f32 - MIDST as f32) / COARSE as f32;
+        let (across, down) = (share(column), share(row));
+        let [upper, lower] = &self.0;
+        let of = |value: fn(&Lit) -> f32| {
+            let along =
+                |row: &[Lit; 2]| value(&row[0]) + (value(&row[1]) - value(&row[0])) * across;
+            let (upper, lower) = (along(upper), along(lower));
+            (upper + (lower - upper) * down).clamp(0.0, 1.0)
+        };
+        Lit {
+            face: self.face(),
+            sky: of(|lit| lit.sky),
+            lamp: of(|lit| lit.lamp),
+        }
+    }
 }
 
 /// Mean light of the points of the same face at most `reach` pixels away, the nearer ones counting more, if there are
@@ -416,9 +465,9 @@ impl Tracer<'_> {
             }
             return;
         }
-        for step in [4, 2, 1] {
+        for step in [COARSE, 2, 1] {
             // The coarsest lattice is centred in the tile.
-            let phase = step / 4 * 2;
+            let phase = step / COARSE * MIDST;
             let on_lattice = |i: usize| i % step == phase;
             let before = known;
             for (column, row, &(at, ref path, _, hit)) in places() {
@@ -430,7 +479,7 @@ impl Tracer<'_> {
                 }
                 let face = face_of(&hit);
                 let shared = match step {
-                    4 => None,
+                    COARSE => None,
                     2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
                     _ => shared(&before, face, (column, row), 1, 1, [SHADOW_EDGE, 1.0])
                         .or_else(|| shared(&before, face, (column, row), 2, 3, LEVEL)),
@@ -438,6 +487,17 @@ impl Tracer<'_> {
                 let light = shared.unwrap_or_else(|| self.light_on(path, &hit, scratch));
                 known[row][column] = Some(light);
                 lit[at] = light;
+            }
+            let Some(level) = (step == COARSE).then(|| Level::between(&known)).flatten() else {
+                continue;
+            };
+            for (column, row, &(at, _, _, hit)) in places() {
+                let same = hit.is_some_and(|hit| face_of(&hit) == level.face());
+                if same && known[row][column].is_none() {
+                    let light = level.at(column, row);
+                    known[row][column] = Some(light);
+                    lit[at] = light;
+                }
             }
         }
     }
