@@ -346,7 +346,6 @@ impl Tracer<'_> {
                     travelled,
                     spread: path.spread * 3.0,
                     weight: path.weight * share,
-                    ..*path
                 },
                 near,
                 scratch,
