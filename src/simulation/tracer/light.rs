@@ -88,6 +88,8 @@ impl LitView {
     }
 
     /// The light on a point, if the camera sees the place: from the pixels around it that show the same face.
+    // Asked for most pixels of the side cameras.
+    #[inline(always)]
     pub(super) fn light_at(&self, hit: &Hit, point: &Point3<f64>) -> Option<Lit> {
         let from_eye = point - self.eye;
         let [u, v, depth_m] = self
