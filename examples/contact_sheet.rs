@@ -111,7 +111,9 @@ fn main() -> anyhow::Result<()> {
                 let cut = cut(&image, middle);
                 let down = top + LINE + half * (height / 2 + GAP);
                 imageops::replace(&mut sheet, &cut, i64::from(close), i64::from(down));
-                write(&mut sheet, (close + GAP, down + GAP), TITLE_DOT, name);
+                let under = RgbImage::new(name.len() as u32 * 6 * TITLE_DOT + GAP, LINE);
+                imageops::replace(&mut sheet, &under, i64::from(close), i64::from(down));
+                write(&mut sheet, (close + GAP, down), TITLE_DOT, name);
             }
             for &(item, _) in &changed {
                 let ink = if capture.moment.standing.contains(&item) {

@@ -303,3 +303,128 @@ impl Solid {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Rotation3;
+
+    use super::*;
+    use crate::{
+        isa::Isa,
+        simulation::{
+            random::Stream,
+            shapes::{Ellipsoid, Ray, Sphere},
+        },
+    };
+
+    fn shapes(stream: &mut Stream) -> Vec<Shape> {
+        let mut point = || {
+            Point3::new(
+                stream.between(-0.3, 0.3),
+                stream.between(-0.3, 0.3),
+                stream.between(0.0, 0.3),
+            )
+        };
+        let [a, b, c, d, e, f] = std::array::from_fn(|_| point());
+        vec![
+            Shape::Sphere(Sphere {
+                center: a,
+                radius: 0.09,
+            }),
+            Shape::Ellipsoid(Ellipsoid::new(
+                b,
+                Vector3::new(0.006, 0.024, 0.09),
+                Rotation3::from_axis_angle(&Vector3::x_axis(), a.x * 9.0),
+            )),
+            Shape::Frustum(Frustum::new(c, d, 0.03, 0.05).with_base().with_top()),
+            Shape::Frustum(Frustum::new(d, e, 0.02, 0.02)),
+            Shape::Disc(Disc {
+                center: e,
+                normal: Vector3::z(),
+                inner_radius: 0.02,
+                radius: 0.1,
+            }),
+            Shape::Solid(Solid::cuboid(f, Vector3::new(0.2, 0.004, 0.1), a.y * 9.0)),
+            Shape::Solid(Solid::gabled(
+                f,
+                Vector3::new(0.1, 0.1, 0.2),
+                0.04,
+                a.y * 9.0,
+            )),
+        ]
+    }
+
+    /// As a camera looks: from a metre or two away, every ray towards somewhere among the shapes.
+    fn rays(stream: &mut Stream) -> (Vec<Ray>, Directions) {
+        let origin = Point3::new(stream.between(-1.0, 1.0), -1.2, stream.between(0.2, 1.5));
+        let mut directions = [[0.0; LANES]; 3];
+        let rays = (0..LANES)
+            .map(|lane| {
+                let mut place = || stream.between(-0.35, 0.35);
+                let towards = Point3::new(place(), place(), place() + 0.15) - origin;
+                let direction = towards.normalize();
+                for axis in 0..3 {
+                    directions[axis][lane] = direction[axis] as f32;
+                }
+                Ray { origin, direction }
+            })
+            .collect();
+        (rays, directions)
+    }
+
+    #[test]
+    fn many_rays_leave_out_nothing_that_one_meets() {
+        let mut stream = Stream::new(5, &[1]);
+        let (mut met, mut named) = (0, 0);
+        for _ in 0..3000 {
+            let (rays, directions) = rays(&mut stream);
+            for shape in shapes(&mut stream) {
+                for isa in Isa::available() {
+                    let mut lanes = 0;
+                    let far = [f32::INFINITY; LANES];
+                    within(isa, &shape, &rays[0].origin, &directions, &far, &mut lanes);
+                    named += lanes.count_ones();
+                    for (lane, ray) in rays.iter().enumerate() {
+                        if let Some(crossing) = shape.crossing(ray, 1e-7, f64::INFINITY) {
+                            met += 1;
+                            assert!(lanes >> lane & 1 == 1, "{shape:?} {ray:?} {crossing:?}");
+                            let mut lanes = 0;
+                            let nearest = [crossing.t as f32; LANES];
+                            let origin = &ray.origin;
+                            within(isa, &shape, origin, &directions, &nearest, &mut lanes);
+                            assert!(lanes >> lane & 1 == 1, "at its own distance: {shape:?}");
+                        }
+                    }
+                }
+            }
+        }
+        assert!(met > 10_000, "the rays meet something: {met}");
+        // So that leaving out is worth it.
+        assert!(named < met + met / 4, "{named} named for {met} met");
+    }
+
+    #[test]
+    fn many_rays_meet_what_one_meets() {
+        let mut stream = Stream::new(6, &[1]);
+        let (mut met, mut differ) = (0, 0);
+        for _ in 0..3000 {
+            let (rays, directions) = rays(&mut stream);
+            for shape in shapes(&mut stream) {
+                let mut nearest = [f32::INFINITY; LANES];
+                shape.approach::<PLAIN>(&rays[0].origin, &directions, &mut nearest);
+                for (ray, &there) in rays.iter().zip(&nearest) {
+                    let here = shape.crossing(ray, 1e-7, f64::INFINITY);
+                    met += usize::from(here.is_some());
+                    let same = match here {
+                        Some(here) => (here.t as f32 - there).abs() < 1e-3,
+                        None => there == f32::INFINITY,
+                    };
+                    differ += usize::from(!same);
+                }
+            }
+        }
+        assert!(met > 10_000, "the rays meet something: {met}");
+        // Rays that only just meet a shape, or miss it.
+        assert!(differ < met / 500, "{differ} of {met} differ");
+    }
+}
