@@ -79,7 +79,8 @@ struct Level {
     /// Correlated pixels count less.
     inverse_discount: f32,
     /// Of the image, pixels.
-    image_focal: f32,
+    image_focal: vec2<f32>,
+    image_center: vec2<f32>,
     position_sd_m: f32,
     rotation_sd_rad: f32,
 }
@@ -98,4 +99,6 @@ struct Estimate {
     level_count: u32,
     /// Comparable pixels of the finest level.
     point_count: u32,
+    /// Whether it is better than the given pose; 0 or 1.
+    accepted: u32,
 }

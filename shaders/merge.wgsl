@@ -72,20 +72,16 @@ fn gather(view: View, u: f32, v: f32) -> Gathered {
     var sum = Gathered(vec4<f32>(0.0), vec3<f32>(LEVEL_OFFSET_Y, 0.0, 0.0), 0.0, vec3<f32>(0.0), vec3<f32>(0.0));
     // tau2 means nothing where p2 is 0, so p2 weighs it.
     for (var i = 0u; i < 3u; i++) {
-        let spread = record_arena[2u * corners[i]];
-        let level = record_arena[2u * corners[i] + 1u];
-        let spread_0 = unpack_spread(spread.x);
-        let spread_1 = unpack_spread(spread.y);
-        let spread_2 = unpack_spread(spread.z);
-        let spread_3 = unpack_spread(spread.w);
+        let sigma = stored_sigma(corners[i]);
+        let level = stored_level(corners[i]);
         let level_0 = unpack_level(level.x);
         let level_1 = unpack_level(level.y);
         let level_2 = unpack_level(level.z);
-        sum.spread += w[i] * vec4<f32>(spread_0, spread_1);
-        sum.sigma += w[i] * vec3<f32>(spread_2, spread_3.x);
-        sum.p2 += w[i] * spread_3.y;
+        sum.spread += w[i] * stored_spread(corners[i]);
+        sum.sigma += w[i] * sigma.xyz;
+        sum.p2 += w[i] * sigma.w;
         sum.tau += w[i] * vec3<f32>(level_0, level_1.x);
-        sum.tau2 += w[i] * spread_3.y * vec3<f32>(level_1.y, level_2);
+        sum.tau2 += w[i] * sigma.w * vec3<f32>(level_1.y, level_2);
     }
     if sum.p2 > 0.0 {
         sum.tau2 = vec3<f32>(LEVEL_OFFSET_Y, 0.0, 0.0) + sum.tau2 / sum.p2;

@@ -8,6 +8,8 @@ const NORMAL_FROM_MEDIAN: f32 = 1.4826;
 const SCALE_MIN: f32 = 0.1;
 const SCALE_MAX: f32 = 3.0;
 const RESIDUAL_CAP: f32 = 4.0;
+const CORRECTION_SD_MAX: f32 = 20.0;
+const MISMATCH_MAX: f32 = 2.0;
 const PIXELS_MIN: u32 = 200u;
 const THIRD_LEVEL_PX: f32 = 2.5;
 const FOURTH_LEVEL_PX: f32 = 4.0;
@@ -143,6 +145,44 @@ fn exponential(vector: vec3<f32>) -> vec4<f32> {
     let s = min(length_square, 1.0);
     let sine = cut * (0.5 - s * (1.0 / 48.0 - s * (1.0 / 3840.0 - s / 645120.0)));
     return vec4<f32>(sine, sqrt(1.0 - dot(sine, sine)));
+}
+
+/// Whether an estimate explains the image better than the given pose and lies within what the noise allows.
+fn is_accepted(level: Level, found: Estimate) -> bool {
+    if found.point_count < PIXELS_MIN || min(found.mismatch.y, found.mismatch_before.y) <= 0.0 {
+        return false;
+    }
+    let before = found.mismatch_before.x / found.mismatch_before.y;
+    let after = found.mismatch.x / found.mismatch.y;
+    let moved = abs(found.translation) < vec3<f32>(CORRECTION_SD_MAX * level.position_sd_m);
+    let turned = abs(logarithm(found.rotation)) < vec3<f32>(CORRECTION_SD_MAX * level.rotation_sd_rad);
+    return after < MISMATCH_MAX && after < before && all(moved) && all(turned);
+}
+
+/// A view as the real camera sees it, from how the given one does: its rows are taken out of the image, moved, and
+/// projected again.
+fn seen_really(view: View, level: Level, found: Estimate) -> View {
+    let focal = level.image_focal;
+    let center = level.image_center;
+    let x = (view.h_x - center.x * view.h_z) / focal.x;
+    let y = (view.h_y - center.y * view.h_z) / focal.y;
+    let back = vec4<f32>(-found.rotation.xyz, found.rotation.w);
+    var rows = array<vec4<f32>, 3>();
+    for (var column = 0u; column < 4u; column++) {
+        var given = vec3<f32>(x[column], y[column], view.h_z[column]);
+        if column == 3u {
+            given -= found.translation;
+        }
+        let real = rotated(back, given);
+        for (var axis = 0u; axis < 3u; axis++) {
+            rows[axis][column] = real[axis];
+        }
+    }
+    var seen = view;
+    seen.h_x = focal.x * rows[0] + center.x * rows[2];
+    seen.h_y = focal.y * rows[1] + center.y * rows[2];
+    seen.h_z = rows[2];
+    return seen;
 }
 
 struct Solution {

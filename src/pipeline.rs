@@ -9,7 +9,7 @@ use rayon::ThreadPool;
 use crate::{
     config::Settings,
     engine::{
-        Answer, Engine, EngineError, Engines, Question,
+        Answer, Engine, Engines, Question,
         cpu::{CpuEngine, Observation, RecallView, Score},
     },
     isa::Isa,
@@ -29,7 +29,7 @@ use crate::{
         events::{Events, Look},
         interpolate::prior::{self, Prior},
         next_view::{self, Promise},
-        refine::{PoseRefiner, REFINE_VIEWS, Refined},
+        refine::PoseRefiner,
         update::UpdateRules,
     },
 };
@@ -258,6 +258,11 @@ impl Pipeline {
         looked
     }
 
+    /// Goes on with an event that was told of before, as after a restart.
+    pub fn resume_event(&mut self, event: Event) {
+        self.events.resume(event);
+    }
+
     /// What the frame that was looked at says about the place's events, before its depth becomes a viewpoint's.
     fn follow_events(&mut self, frame: &Frame, report: &mut Report) -> Vec<Event> {
         let mut events = std::mem::take(&mut self.events);
@@ -397,19 +402,7 @@ impl Pipeline {
         let mut maps = std::mem::take(&mut self.maps);
         self.engine.observe(&frame.image, &mut work.observation);
 
-        let refined = self.refine(frame, &work.observation, visit, &mut work.selected);
-        let refined = match refined {
-            Ok(refined) => refined,
-            Err(error) => {
-                self.workspace = work;
-                self.maps_read = true;
-                return Err(FrameError::Engine(error.to_string()));
-            }
-        };
-        let world_from_camera = refined.world_from_camera;
-        ended(Stage::Refine);
-
-        self.select(&world_from_camera, &mut work.selected);
+        self.select(&frame.world_from_camera, &mut work.selected);
         let used = self.ids(&work.selected);
         visit.select(&used);
 
@@ -417,7 +410,11 @@ impl Pipeline {
         let question = Question {
             views: &views,
             intrinsics: &frame.intrinsics,
-            world_from_camera: &world_from_camera,
+            world_from_camera: &frame.world_from_camera,
+            noise: self.settings.refine_pose.then(|| {
+                let own = frame.pose_noise;
+                own.unwrap_or_else(|| self.settings.pose_noise(&frame.source.robot))
+            }),
             image: &frame.image,
             observation: &work.observation,
         };
@@ -426,10 +423,13 @@ impl Pipeline {
             score: &mut maps.score,
             evidence: &mut maps.evidence,
             blocks: &mut work.blocks,
+            refiner: &mut self.refiner,
         };
+        let between = &mut || ended(Stage::Refine);
+        let evidence = self.settings.evidence;
         let compared = self
             .engine
-            .compare(&question, self.settings.evidence, learn, answer);
+            .compare(&question, evidence, learn, answer, between);
         self.whole_maps.take();
         ended(Stage::Compare);
         let compared = match compared {
@@ -442,6 +442,8 @@ impl Pipeline {
         };
         maps.intrinsics = Some(frame.intrinsics);
         self.maps_read = compared.maps_read;
+        let refined = compared.refined;
+        let world_from_camera = refined.world_from_camera;
 
         let scene = Scene {
             depth_m: &work.depth_m,
@@ -477,31 +479,6 @@ impl Pipeline {
         self.maps = maps;
         self.workspace = work;
         Ok(report)
-    }
-
-    fn refine(
-        &mut self,
-        frame: &Frame,
-        observation: &Observation,
-        visit: &Visit,
-        selected: &mut Vec<usize>,
-    ) -> Result<Refined, EngineError> {
-        if !self.settings.refine_pose {
-            return Ok(Refined::unchanged(frame.world_from_camera));
-        }
-        let noise = frame
-            .pose_noise
-            .unwrap_or_else(|| self.settings.pose_noise(&frame.source.robot));
-        self.select(&frame.world_from_camera, selected);
-        selected.truncate(REFINE_VIEWS);
-        let question = Question {
-            views: &recall_views(&self.memory, &self.settings, selected, visit),
-            intrinsics: &frame.intrinsics,
-            world_from_camera: &frame.world_from_camera,
-            image: &frame.image,
-            observation,
-        };
-        self.engine.refine(&question, noise, &mut self.refiner)
     }
 
     fn select(&self, world_from_camera: &Pose, selected: &mut Vec<usize>) {

@@ -12,7 +12,7 @@ use surprised::{
         layout::{Estimate, Exposure, Frame, Level, Rules, View},
         passes::{EXPOSE, EXPOSE_PIXELS, HISTOGRAM_WORDS, PASSES, Pass},
     },
-    model::viewpoint::VIEWS_MAX,
+    model::{belief::Record, viewpoint::VIEWS_MAX},
 };
 
 /// What every WebGPU device grants.
@@ -20,11 +20,15 @@ const STORAGE_BUFFERS_MAX: usize = 8;
 const WORKGROUP_BYTES_MAX: u32 = 16 << 10;
 
 fn validated(pass: &Pass) -> (Module, ModuleInfo) {
-    let module = naga::front::wgsl::parse_str(pass.source)
-        .unwrap_or_else(|error| panic!("{}: {}", pass.label, error.emit_to_string(pass.source)));
-    let info = Validator::new(ValidationFlags::all(), Capabilities::empty())
+    valid(pass.label, pass.source, Capabilities::empty())
+}
+
+fn valid(label: &str, source: &str, capabilities: Capabilities) -> (Module, ModuleInfo) {
+    let module = naga::front::wgsl::parse_str(source)
+        .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(source)));
+    let info = Validator::new(ValidationFlags::all(), capabilities)
         .validate(&module)
-        .unwrap_or_else(|error| panic!("{}: {}", pass.label, error.emit_to_string(pass.source)));
+        .unwrap_or_else(|error| panic!("{label}: {}", error.emit_to_string(source)));
     (module, info)
 }
 
@@ -33,6 +37,29 @@ fn every_shader_is_valid_without_optional_features() {
     for pass in &PASSES {
         validated(pass);
     }
+}
+
+#[test]
+fn half_precision_reads_what_is_stored_from_where_it_is() {
+    let mut native = 0;
+    for pass in &PASSES {
+        let Some(source) = pass.source_f16 else {
+            continue;
+        };
+        let half = Capabilities::SHADER_FLOAT16;
+        let (module, _) = valid(pass.label, source, half);
+        let (members, span) = layout_of(&module, "NativeRecord").expect("records are read");
+        let offset = |name: &str| {
+            let member = members.iter().find(|(member, _)| member == name);
+            member.unwrap_or_else(|| panic!("no {name}")).1 as usize
+        };
+        assert_eq!(span as usize, size_of::<Record>());
+        assert_eq!(offset("spread"), std::mem::offset_of!(Record, spread));
+        assert_eq!(offset("sigma"), std::mem::offset_of!(Record, spread) + 8);
+        assert_eq!(offset("level"), std::mem::offset_of!(Record, level));
+        native += 1;
+    }
+    assert_eq!(native, 1);
 }
 
 #[test]
@@ -48,7 +75,10 @@ fn every_shader_file_is_part_of_a_pass() {
             {
                 let text = std::fs::read_to_string(&path).unwrap();
                 assert!(
-                    PASSES.iter().any(|pass| pass.source.contains(&text)),
+                    PASSES.iter().any(|pass| {
+                        let native = pass.source_f16.unwrap_or_default();
+                        pass.source.contains(&text) || native.contains(&text)
+                    }),
                     "{path:?} belongs to no pass"
                 );
                 files += 1;
@@ -184,6 +214,7 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             image_width,
             inverse_discount,
             image_focal,
+            image_center,
             position_sd_m,
             rotation_sd_rad,
         }),
@@ -196,6 +227,7 @@ fn structs_have_the_same_fields_at_the_same_offsets() {
             offset,
             level_count,
             point_count,
+            accepted,
         }),
     ];
     for (name, fields, size) in structs {

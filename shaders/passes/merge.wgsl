@@ -4,7 +4,6 @@
 @group(0) @binding(1) var<uniform> rules: Rules;
 @group(0) @binding(2) var<uniform> views: array<View, VIEWS_MAX>;
 @group(0) @binding(3) var<storage, read> depth_arena: array<u32>;
-@group(0) @binding(4) var<storage, read> record_arena: array<vec4<u32>>;
 @group(0) @binding(5) var<storage, read> nearest: array<u32>;
 @group(0) @binding(6) var<storage, read> triangles: array<u32>;
 /// alpha, beta.

@@ -28,8 +28,8 @@ fn level_count() -> u32 {
         rank -= histogram[middle];
         middle += 1u;
     }
-    let from_position = level.image_focal * level.position_sd_m / depth_of_bin_m(middle);
-    let from_rotation = level.image_focal * level.rotation_sd_rad;
+    let from_position = level.image_focal.x * level.position_sd_m / depth_of_bin_m(middle);
+    let from_rotation = level.image_focal.x * level.rotation_sd_rad;
     let error_px = length(vec2<f32>(from_position, from_rotation));
     return 2u + select(0u, 1u, error_px > THIRD_LEVEL_PX) + select(0u, 1u, error_px > FOURTH_LEVEL_PX);
 }
@@ -45,6 +45,7 @@ fn begin(@builtin(local_invocation_index) thread: u32) {
         estimate.offset = 0.0;
         estimate.level_count = level_count();
         estimate.point_count = 0u;
+        estimate.accepted = 0u;
     }
     storageBarrier();
     clear_histogram(thread);

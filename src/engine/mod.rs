@@ -58,10 +58,12 @@ pub enum EngineError {
 /// An image, and the views that say what it should look like.
 #[derive(Clone, Copy)]
 pub struct Question<'a> {
-    /// At most 16, with different ids.
+    /// At most 16, with different ids, nearest first.
     pub views: &'a [RecallView<'a>],
     pub intrinsics: &'a Intrinsics,
     pub world_from_camera: &'a Pose,
+    /// Of the pose, where it is to be corrected first, against what the nearest views expect.
+    pub noise: Option<PoseNoise>,
     pub image: &'a RgbImage,
     /// The image in luminance and chrominance, as [`Engine::observe`] leaves it.
     pub observation: &'a Observation,
@@ -73,13 +75,16 @@ pub struct Answer<'a> {
     pub score: &'a mut Score,
     /// What regions and thresholds look at, nats.
     pub evidence: &'a mut BlockMap,
-    /// Working memory.
+    /// Working memory, of the processor.
     pub blocks: &'a mut BlockMap,
+    pub refiner: &'a mut PoseRefiner,
 }
 
 /// What is known of every compared image, beside its evidence.
 #[derive(Debug, Clone)]
 pub struct Compared {
+    /// Whence the image was compared.
+    pub refined: Refined,
     /// Pixels that some viewpoint saw.
     pub seen: usize,
     /// Whether prior and score are whole; else [`Engine::maps`] completes them.
@@ -153,31 +158,8 @@ impl Engines {
 }
 
 impl Engine {
-    /// The pose of an image, corrected against what its nearest views expect. [`Self::compare`] must follow with the same
-    /// image. `refiner` is used where the processor computes.
-    ///
-    /// # Errors
-    /// As [`Self::compare`].
-    pub fn refine(
-        &mut self,
-        question: &Question,
-        noise: PoseNoise,
-        refiner: &mut PoseRefiner,
-    ) -> Result<Refined, EngineError> {
-        let gpu = match self {
-            Self::Cpu(engine) => return Ok(refine_on_processor(engine, question, noise, refiner)),
-            Self::Gpu(gpu) => gpu,
-        };
-        match gpu.refine(question, noise, refiner) {
-            Err(error) if gpu.falls_back() => {
-                self.fall_back(&error);
-                self.refine(question, noise, refiner)
-            }
-            result => result,
-        }
-    }
-
-    /// Compares an image with what its views expect. `score` has the gain then, the surprise map wherever the evidence
+    /// Compares an image with what its views expect. `refined` is called between refining the pose and comparing, unless both
+    /// are done at once. `score` has the gain then, the surprise map wherever the evidence
     /// seeds a region, and the posterior if it is learnt; the rest when [`Compared::maps_read`] says so.
     ///
     /// # Errors
@@ -188,6 +170,7 @@ impl Engine {
         evidence: Evidence,
         learn: bool,
         mut answer: Answer<'_>,
+        refined: &mut dyn FnMut(),
     ) -> Result<Compared, EngineError> {
         let gpu = match self {
             Self::Cpu(engine) => {
@@ -196,6 +179,7 @@ impl Engine {
                     question,
                     evidence,
                     &mut answer,
+                    refined,
                 ));
             }
             Self::Gpu(gpu) => gpu,
@@ -203,7 +187,7 @@ impl Engine {
         match gpu.compare(question, learn, &mut answer) {
             Err(error) if gpu.falls_back() => {
                 self.fall_back(&error);
-                self.compare(question, evidence, learn, answer)
+                self.compare(question, evidence, learn, answer, refined)
             }
             result => result,
         }
@@ -311,9 +295,9 @@ fn observed<T>(engine: &CpuEngine, question: &Question, work: impl FnOnce(&Obser
 }
 
 fn refine_on_processor(
-    engine: &CpuEngine,
     question: &Question,
     noise: PoseNoise,
+    observation: &Observation,
     refiner: &mut PoseRefiner,
 ) -> Refined {
     let views: ArrayVec<(&Coarse, &Pose, f32), REFINE_VIEWS> = question
@@ -329,15 +313,13 @@ fn refine_on_processor(
             (coarse, world_from_camera, view.weight)
         })
         .collect();
-    observed(engine, question, |observation| {
-        refiner.refine(
-            &views,
-            &observation.planes[0],
-            question.intrinsics,
-            question.world_from_camera,
-            noise,
-        )
-    })
+    refiner.refine(
+        &views,
+        &observation.planes[0],
+        question.intrinsics,
+        question.world_from_camera,
+        noise,
+    )
 }
 
 fn compare_on_processor(
@@ -345,25 +327,34 @@ fn compare_on_processor(
     question: &Question,
     evidence: Evidence,
     answer: &mut Answer,
+    between: &mut dyn FnMut(),
 ) -> Compared {
     let Answer {
         prior,
         score,
         evidence: found,
         blocks,
+        refiner,
     } = answer;
-    let seen = observed(engine, question, |observation| {
-        engine.compare(
+    let (refined, seen) = observed(engine, question, |observation| {
+        let given = Refined::unchanged(*question.world_from_camera);
+        let refined = question.noise.map_or(given, |noise| {
+            refine_on_processor(question, noise, observation, refiner)
+        });
+        between();
+        let seen = engine.compare(
             question.views,
             question.intrinsics,
-            question.world_from_camera,
+            &refined.world_from_camera,
             observation,
             prior,
             score,
-        )
+        );
+        (refined, seen)
     });
     found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {
+        refined,
         seen,
         maps_read: true,
     }

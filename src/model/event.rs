@@ -74,6 +74,8 @@ pub struct Event {
     pub peak_surprise: f32,
     /// Greatest share of a frame that was never seen, 0..1.
     pub unseen_share: f32,
+    /// Of what was never seen: points spread over what is still unknown of it, metres.
+    pub unseen_points: Vec<Point3<f64>>,
     /// Frames in which it was surprising, or unseen.
     pub sightings: u32,
     /// Who saw it, in the order they did.

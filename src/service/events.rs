@@ -21,7 +21,10 @@ use zenoh::{
 use super::{ingest::IngestCounters, places::Places};
 use crate::{
     model::event::{Event, Picture},
-    wire::{encode, keys, proto},
+    wire::{
+        encode::{self, EVENT_STATES},
+        keys, proto,
+    },
 };
 
 /// Ended events that are still told of.
@@ -45,18 +48,13 @@ struct Kept {
 }
 
 impl PlaceEvents {
-    /// Takes an event's new state and returns its message.
-    pub fn put(&mut self, event: &Event, place: &str) -> Arc<proto::Event> {
+    /// Takes an event's new state and returns its message, and the id of the event that is told of no more.
+    pub fn put(&mut self, event: &Event, place: &str) -> (Arc<proto::Event>, Option<u64>) {
         let before = self.open.remove(&event.id);
         let mut message = encode::event(event, place);
         match (&before, &event.picture) {
             // Packing pictures takes longer than all the rest.
-            (Some(before), Some(picture))
-                if before
-                    .picture
-                    .as_ref()
-                    .is_some_and(|packed| Arc::ptr_eq(packed, picture)) =>
-            {
+            (Some(before), now) if before.has(now.as_ref()) => {
                 message.picture.clone_from(&before.message.picture);
                 message
                     .expected_picture
@@ -68,19 +66,31 @@ impl PlaceEvents {
             (_, None) => {}
         }
         let message = Arc::new(message);
-        if event.is_open() {
-            let kept = Kept {
-                message: message.clone(),
-                picture: event.picture.clone(),
-            };
-            self.open.insert(event.id, kept);
-        } else {
-            if self.ended.len() == ENDED_MAX {
-                self.ended.pop_front();
-            }
-            self.ended.push_back(message.clone());
+        let picture = event.picture.clone();
+        let gone = self.keep(message.clone(), picture);
+        (message, gone)
+    }
+
+    /// Takes an event that was told of before, with its pictures; the id of the event that is told of no more.
+    pub fn restore(&mut self, message: proto::Event) -> Option<u64> {
+        self.open.remove(&message.id);
+        self.ended.retain(|event| event.id != message.id);
+        let gone = self.keep(Arc::new(message), None);
+        self.ended
+            .make_contiguous()
+            .sort_by_key(|event| event.ended.map(|at| (at.seconds, at.nanos)));
+        gone
+    }
+
+    fn keep(&mut self, message: Arc<proto::Event>, picture: Option<Arc<Picture>>) -> Option<u64> {
+        if message.state != EVENT_STATES[2] {
+            self.open.insert(message.id, Kept { message, picture });
+            return None;
         }
-        message
+        self.ended.push_back(message);
+        let over = self.ended.len() > ENDED_MAX;
+        let gone = over.then(|| self.ended.pop_front()).flatten();
+        gone.map(|event| event.id)
     }
 
     /// Those that last, the newest first.
@@ -96,6 +106,18 @@ impl PlaceEvents {
     pub fn get(&self, id: u64) -> Option<&Arc<proto::Event>> {
         let open = self.open.get(&id).map(|kept| &kept.message);
         open.or_else(|| self.ended.iter().find(|event| event.id == id))
+    }
+}
+
+impl Kept {
+    /// Whether the message's pictures are those of an event whose picture is `now`. One that goes on after a restart has
+    /// none until it has a new one.
+    fn has(&self, now: Option<&Arc<Picture>>) -> bool {
+        match (&self.picture, now) {
+            (Some(packed), Some(now)) => Arc::ptr_eq(packed, now),
+            (packed, None) => packed.is_none(),
+            (None, Some(_)) => false,
+        }
     }
 }
 

@@ -681,6 +681,11 @@ impl Out<'_, '_> {
         self.counters("gpu_uploaded_bytes", "Bytes moved to the card", |place| {
             gpu(place).uploaded_bytes
         })?;
+        self.counters(
+            "gpu_read_backs",
+            "Times that a frame waited for the card",
+            |place| gpu(place).read_backs,
+        )?;
         self.counters("gpu_read_back_bytes", "Bytes moved back", |place| {
             gpu(place).read_back_bytes
         })?;

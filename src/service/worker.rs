@@ -410,6 +410,7 @@ impl Desk {
             root,
             session,
             events,
+            memory,
             metrics,
             news,
             ..
@@ -421,8 +422,16 @@ impl Desk {
             }
         };
         for event in &report.events {
-            let mut message = Arc::default();
-            events.send_modify(|events| message = Arc::make_mut(events).put(event, place));
+            let (mut message, mut gone) = (Arc::default(), None);
+            events.send_modify(|events| {
+                (message, gone) = Arc::make_mut(events).put(event, place);
+            });
+            if let Some(memory) = memory {
+                memory.keep_event(message.id, Some(encode::bytes(&*message)));
+                if let Some(gone) = gone {
+                    memory.keep_event(gone, None);
+                }
+            }
             events::publish(session, root, &message);
             metrics.event(place, &message.kind, &message.state);
             tell(News::Event(message));
@@ -459,6 +468,37 @@ impl Desk {
         } = &mut self.worker;
         if let Some(memory) = memory {
             memory.sync(pipeline.memory_mut());
+        }
+        self.sync_events();
+    }
+
+    /// Goes on with stored events, as after a restart.
+    fn sync_events(&mut self) {
+        let Worker {
+            place,
+            memory,
+            pipeline,
+            events,
+            ..
+        } = &mut self.worker;
+        let Some(memory) = memory else { return };
+        for (id, content) in memory.take_events() {
+            match decode::event::stored(&content) {
+                Ok((message, event)) => {
+                    pipeline.resume_event(event);
+                    let mut gone = None;
+                    events.send_modify(|events| gone = Arc::make_mut(events).restore(message));
+                    if let Some(gone) = gone {
+                        memory.keep_event(gone, None);
+                    }
+                }
+                Err(refusal) => {
+                    tracing::warn!(
+                        place = &**place,
+                        "stored event {id} is not told of: {refusal}"
+                    );
+                }
+            }
         }
     }
 

@@ -77,6 +77,14 @@ impl Refined {
             correction_rad: 0.0,
         }
     }
+
+    pub fn moved(world_from_given: &Pose, given_from_real: &Pose) -> Self {
+        Self {
+            world_from_camera: world_from_given * given_from_real,
+            correction_m: given_from_real.translation.vector.norm(),
+            correction_rad: given_from_real.rotation.angle(),
+        }
+    }
 }
 
 /// The noise that refinement assumes.
@@ -101,7 +109,7 @@ pub fn precision(noise: PoseNoise) -> [f64; 8] {
 
 /// The refined pose, if it explains the image better than the given one and lies within what the noise allows.
 /// Mismatches are mean capped residuals, predicted standard deviations.
-pub fn accepted(
+fn accepted(
     world_from_given: &Pose,
     given_from_real: &Pose,
     noise: PoseNoise,
@@ -118,11 +126,7 @@ pub fn accepted(
         };
         motion[axis].abs() < CORRECTION_SD_MAX * sd
     });
-    (improved && in_bounds).then(|| Refined {
-        world_from_camera: world_from_given * given_from_real,
-        correction_m: given_from_real.translation.vector.norm(),
-        correction_rad: given_from_real.rotation.angle(),
-    })
+    (improved && in_bounds).then(|| Refined::moved(world_from_given, given_from_real))
 }
 
 /// Luminance, variance and depth that the memory predicts, or what was observed, at one resolution.

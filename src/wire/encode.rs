@@ -326,6 +326,7 @@ pub fn event_pictures(pictures: &Picture) -> (Option<proto::Image>, Option<proto
 /// An event's kinds and states by name.
 pub const EVENT_KINDS: [&str; 2] = ["change", "unseen"];
 pub const EVENT_STATES: [&str; 3] = ["new", "update", "end"];
+pub const END_REASONS: [&str; 2] = ["seen_again", "no_room"];
 
 /// Without its pictures.
 pub fn event(event: &Event, place: &str) -> proto::Event {
@@ -348,8 +349,8 @@ pub fn event(event: &Event, place: &str) -> proto::Event {
         ended: event.ended_ns.map(timestamp),
         end_reason: match event.state {
             State::New | State::Update => "",
-            State::End(EndReason::SeenAgain) => "seen_again",
-            State::End(EndReason::NoRoom) => "no_room",
+            State::End(EndReason::SeenAgain) => END_REASONS[0],
+            State::End(EndReason::NoRoom) => END_REASONS[1],
         }
         .to_owned(),
         center_in_world: event.center_in_world.as_ref().map(vector),
@@ -362,6 +363,7 @@ pub fn event(event: &Event, place: &str) -> proto::Event {
         last: Some(sighting(&event.last)),
         picture: None,
         expected_picture: None,
+        unseen_points: event.unseen_points.iter().map(vector).collect(),
     }
 }
 

@@ -13,7 +13,7 @@ use surprised::{
     },
 };
 
-use super::{CardRules, card_engines, processor};
+use super::{CardRules, card_engines, processor, skipped};
 
 fn recordings() -> Option<Vec<Recording>> {
     let data = std::env::var_os("SURPRISED_DATA")
@@ -40,12 +40,10 @@ fn evaluate(recordings: &[Recording], engines: &Engines) -> Vec<PassSummary> {
 #[test]
 fn selectivities_of_the_tabletop_are_those_of_the_processor() {
     let Some(recordings) = recordings() else {
-        writeln!(std::io::stderr(), "SKIPPED: no recordings").unwrap();
-        println!("skipped: no recordings");
+        skipped("no recordings");
         return;
     };
     let Some(card) = card_engines(CardRules::any()) else {
-        println!("skipped: no adapter");
         return;
     };
     let got = evaluate(&recordings, &card);

@@ -3,10 +3,10 @@
 use std::io::Write;
 
 use surprised::{
-    config::Settings,
+    config::{Evidence, Settings},
     engine::{
-        Engine, Question,
-        cpu::{Observation, RecallView},
+        Answer, Engine, Question,
+        cpu::{Observation, RecallView, Score},
     },
     model::{
         belief::rgb_from_ycbcr,
@@ -15,7 +15,11 @@ use surprised::{
         pose::{Pose, PoseNoise},
         viewpoint::Viewpoint,
     },
-    stages::refine::{PoseRefiner, Refined},
+    stages::{
+        attend::BlockMap,
+        interpolate::prior::Prior,
+        refine::{PoseRefiner, Refined},
+    },
 };
 
 use super::{
@@ -101,12 +105,19 @@ fn refine(
         views: &views,
         intrinsics: &case.camera,
         world_from_camera: given,
+        noise: Some(noise),
         image: &case.image,
         observation: &Observation::default(),
     };
-    engine
-        .refine(&question, noise, &mut PoseRefiner::default())
-        .expect("the device is there")
+    let answer = Answer {
+        prior: &mut Prior::default(),
+        score: &mut Score::default(),
+        evidence: &mut BlockMap::default(),
+        blocks: &mut BlockMap::default(),
+        refiner: &mut PoseRefiner::default(),
+    };
+    let compared = engine.compare(&question, Evidence::BlockMedian, false, answer, &mut || {});
+    compared.expect("the device is there").refined
 }
 
 fn noise(millimetres: f64, degrees: f64) -> PoseNoise {

@@ -10,10 +10,12 @@ import subprocess
 import sys
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from pathlib import Path
 
 import pytest
+import scene
 from daemon import BINARY, Daemon, Robot, ask, await_condition, open_session, remembered
 
 KILLS = 6
@@ -87,6 +89,49 @@ def test_after_a_kill_the_next_service_answers_what_the_last_one_had_learnt(serv
     assert "viewpoints recovered" in second.log()
     # And it goes on.
     learn(second, "lab", 3, begin=100)
+
+
+def test_events_go_on_after_a_kill(services, url):
+    def events(daemon: Daemon) -> list[dict]:
+        listed = daemon.fetch_json("/api/v1/places/lab/events")["events"]
+        return [event for event in listed if event["kind"] == "change"]
+
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        for _ in range(8):
+            robot.show()
+        await_stored(first, "lab")
+        ask(session, "surprised/lab/@memory/mode?set=observe")
+        for _ in range(3):
+            robot.show(scene.BOX)
+        (event,) = events(first)
+        kept = Path(urllib.parse.urlparse(url).path) / "lab" / "events"
+        await_condition("it is stored", lambda: any(kept.glob(f"{int(event['id']):016x}-*[0-9a-f]")))
+        path = f"/api/v1/places/lab/events/{event['id']}/seen.jpg"
+        picture = first.fetch(path)[2]
+    first.stop(signal.SIGKILL)
+
+    second = services(url)
+    await_role(second, "lab", "writer")
+    await_condition("the event is known", lambda: events(second))
+    assert events(second) == [event]
+    assert second.fetch(path)[2] == picture
+    with open_session(second.endpoint) as session:
+        after = Robot(session, "lab")
+        after.sequence, after.stamp_ns = robot.sequence, robot.stamp_ns
+        regions = after.show(scene.BOX).regions
+        assert [region.event_id for region in regions] == [int(event["id"])]
+        for _ in range(8):
+            after.show()
+        (ended,) = events(second)
+        assert (ended["id"], ended["state"], ended["first_seen"]) == (event["id"], "end", event["first_seen"])
+        assert second.fetch(path)[2] == picture
+    assert second.stop() == 0
+
+    third = services(url)
+    await_condition("the event is known", lambda: events(third))
+    assert events(third) == [ended]
 
 
 def test_a_clean_stop_loses_nothing(services, url):

@@ -43,6 +43,8 @@ on_every_backend! {
     places_are_apart_and_listed,
     what_was_said_about_modes_holds_after_a_crash_and_for_who_takes_over,
     damaged_modes_are_set_aside_and_what_was_said_before_holds,
+    the_newest_state_of_every_event_is_there_after_a_crash_and_for_who_follows,
+    a_damaged_event_is_set_aside_and_an_earlier_state_serves,
 }
 
 /// Blocks on a look at the objects themselves.
@@ -395,6 +397,74 @@ fn damaged_modes_are_set_aside_and_what_was_said_before_holds(backend: &Backend)
     );
     service.stop();
     assert_eq!(objects_below(backend, "modes").len(), 1);
+}
+
+/// What a service has read of events since it was asked last, by id.
+fn events(service: &Service) -> Vec<(u64, Vec<u8>)> {
+    let events = service.store.take_events().into_iter();
+    let mut events: Vec<(u64, Vec<u8>)> =
+        events.map(|(id, content)| (id, content.to_vec())).collect();
+    events.sort();
+    events
+}
+
+fn the_newest_state_of_every_event_is_there_after_a_crash_and_for_who_follows(backend: &Backend) {
+    let mut first = Service::writer(&backend.store());
+    let keep = |service: &Service, id: u64, content: &[u8]| {
+        service.store.keep_event(id, Some(content.to_vec()));
+    };
+    keep(&first, 7, b"a cup");
+    keep(&first, 8, b"a hat");
+    first.until_stored();
+    keep(&first, 7, b"a cup, higher");
+    keep(&first, 9, b"");
+    first.store.keep_event(8, None);
+    first.until_stored();
+    assert_eq!(objects_below(backend, "events").len(), 2);
+    assert!(events(&first).is_empty(), "it said all of it itself");
+
+    let mut second = Service::start(&backend.store());
+    second.until("it reads", |service| {
+        matches!(service.store.role(), Role::Reader { .. })
+    });
+    let kept = [(7, b"a cup, higher".to_vec()), (9, Vec::new())];
+    assert_eq!(events(&second), kept);
+    keep(&second, 7, b"not its own place");
+    first.crash();
+    second.until("it has taken over", |service| {
+        service.store.role() == Role::Writer
+    });
+    assert!(events(&second).is_empty(), "nothing is new");
+    keep(&second, 7, b"gone");
+    second.until_stored();
+    second.crash();
+
+    let third = Service::writer(&backend.store());
+    assert_eq!(events(&third), [(7, b"gone".to_vec()), (9, Vec::new())]);
+    third.stop();
+    assert_eq!(objects_below(backend, "events").len(), 2);
+}
+
+fn a_damaged_event_is_set_aside_and_an_earlier_state_serves(backend: &Backend) {
+    let mut service = Service::writer(&backend.store());
+    service.store.keep_event(1, Some(b"a cup".to_vec()));
+    service.until_stored();
+    service.stop();
+    let before = objects_below(backend, "events").swap_remove(0).location;
+    let name = "0000000000000001-00000001-00000000000000ff";
+    let (_, root) = backend.objects_at();
+    let newer = root.join(PLACE).join("events").join(name);
+    let mut bytes = read(backend, &before);
+    bytes[2] ^= 1;
+    write(backend, &newer, bytes);
+    let service = Service::writer(&backend.store());
+    assert_eq!(events(&service), [(1, b"a cup".to_vec())]);
+    let status = service.store.status();
+    assert_eq!(status.damaged, 1);
+    let aside = &status.damaged_names[0];
+    assert!(aside.ends_with(&format!("damaged/event-{name}")), "{aside}");
+    service.stop();
+    assert_eq!(objects_below(backend, "events").len(), 1);
 }
 
 fn places_are_apart_and_listed(backend: &Backend) {

@@ -20,24 +20,26 @@ pub const RECORD_BYTES: u64 = size_of::<Record>() as u64;
 pub const PRIOR_BYTES: u64 = 4 * size_of::<f32>() as u64;
 pub const EXPOSURE_BYTES: u64 = size_of::<Exposure>().next_multiple_of(16) as u64;
 pub const ESTIMATE_BYTES: u64 = size_of::<Estimate>() as u64;
+const VIEWS_BYTES: u64 = (VIEWS_MAX * size_of::<View>()) as u64;
 /// Luminance, variance, depth and observation.
 const PYRAMID_BYTES: u64 = 4 * size_of::<f32>() as u64;
 /// Levels lie as far apart as every device allows bindings to begin.
 const LEVEL_STRIDE: u64 = 256;
 /// Begin and end of every pass.
 pub const STAMPS_BYTES: u64 = (PASSES.len() * 2 * size_of::<u64>()) as u64;
+/// What of a report does not depend on the image's size.
+pub const REPORT_HEAD_BYTES: u64 = EXPOSURE_BYTES + ESTIMATE_BYTES + STAMPS_BYTES;
 
 /// Of all images alike.
 pub struct SharedBuffers {
     frame: wgpu::Buffer,
     rules: wgpu::Buffer,
     views: wgpu::Buffer,
+    given_views: wgpu::Buffer,
     half_frame: wgpu::Buffer,
     coarse_views: wgpu::Buffer,
     levels: wgpu::Buffer,
     pub estimate: wgpu::Buffer,
-    /// What refinement reads: the estimate, and time stamps.
-    pub refined: wgpu::Buffer,
     pub histogram: wgpu::Buffer,
     pub exposure: wgpu::Buffer,
     pub stamps: wgpu::Buffer,
@@ -50,23 +52,15 @@ impl SharedBuffers {
         let shared = Self {
             frame: device.buffer("frame", size_of::<Frame>() as u64, uniform),
             rules: device.buffer("rules", size_of::<Rules>() as u64, uniform),
-            views: device.buffer("views", (VIEWS_MAX * size_of::<View>()) as u64, uniform),
+            views: device.buffer("views", VIEWS_BYTES, uniform | BufferUsages::STORAGE),
+            given_views: device.buffer("given_views", VIEWS_BYTES, uniform),
             half_frame: device.buffer("half_frame", size_of::<Frame>() as u64, uniform),
-            coarse_views: device.buffer(
-                "coarse_views",
-                (VIEWS_MAX * size_of::<View>()) as u64,
-                uniform,
-            ),
+            coarse_views: device.buffer("coarse_views", VIEWS_BYTES, uniform),
             levels: device.buffer("levels", LEVEL_STRIDE * LEVELS_MAX as u64, uniform),
             estimate: device.buffer(
                 "estimate",
                 ESTIMATE_BYTES,
                 storage | BufferUsages::UNIFORM | BufferUsages::COPY_SRC,
-            ),
-            refined: device.buffer(
-                "refined",
-                ESTIMATE_BYTES + STAMPS_BYTES,
-                BufferUsages::COPY_DST | BufferUsages::MAP_READ,
             ),
             histogram: device.buffer("histogram", 4 * HISTOGRAM_WORDS, storage),
             exposure: device.buffer(
@@ -84,10 +78,15 @@ impl SharedBuffers {
         shared
     }
 
-    /// Returns how many bytes went up.
-    pub fn upload(&self, device: &Device, frame: &Frame, views: &[View]) -> u64 {
+    /// Returns how many bytes went up. `given`: the views are placed anew when the pose is refined.
+    pub fn upload(&self, device: &Device, frame: &Frame, views: &[View], given: bool) -> u64 {
+        let to = if given {
+            &self.given_views
+        } else {
+            &self.views
+        };
         device.upload(&self.frame, 0, bytemuck::bytes_of(frame));
-        device.upload(&self.views, 0, bytemuck::cast_slice(views));
+        device.upload(to, 0, bytemuck::cast_slice(views));
         (size_of::<Frame>() + size_of_val(views)) as u64
     }
 
@@ -159,7 +158,7 @@ pub struct ScoreBuffers {
     pub block_medians: wgpu::Buffer,
     pub pyramid: wgpu::Buffer,
     pub partial_sums: wgpu::Buffer,
-    /// What every frame reads: exposure, time stamps, evidence, and the posterior if it is learnt.
+    /// What every frame reads: exposure, estimate, time stamps, evidence, and the posterior if it is learnt.
     pub report: wgpu::Buffer,
 }
 
@@ -179,7 +178,7 @@ impl ScoreBuffers {
             partial_sums: device.buffer("partial_sums", 4 * u64::from(SUMS) * groups, storage),
             report: device.buffer(
                 "report",
-                EXPOSURE_BYTES + STAMPS_BYTES + 4 * frame.blocks() + RECORD_BYTES * pixels,
+                REPORT_HEAD_BYTES + 4 * frame.blocks() + RECORD_BYTES * pixels,
                 BufferUsages::COPY_DST | BufferUsages::MAP_READ,
             ),
         }
@@ -189,7 +188,7 @@ impl ScoreBuffers {
 /// Whether a device can hold what an image needs, with maps of so many views.
 pub fn fits(device: &Device, frame: &Frame, views: u32) -> bool {
     let pixels = frame.pixels();
-    let largest = (RECORD_BYTES * pixels + EXPOSURE_BYTES + STAMPS_BYTES + 4 * frame.blocks())
+    let largest = (REPORT_HEAD_BYTES + 4 * frame.blocks() + RECORD_BYTES * pixels)
         .max(4 * pixels * u64::from(views));
     largest.next_multiple_of(16) <= device.buffer_max()
 }
@@ -247,6 +246,7 @@ impl<'a> Bound<'a> {
             Slot::Pyramid => &score().pyramid,
             Slot::PartialSums => &score().partial_sums,
             Slot::Estimate => &self.shared.estimate,
+            Slot::GivenViews => &self.shared.given_views,
         }
     }
 }

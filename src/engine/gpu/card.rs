@@ -25,6 +25,8 @@ pub struct CardRules {
     pub falls_back: bool,
     /// Of all places' viewpoints together. What a single recall needs is granted beyond it.
     pub arena_bytes_max: u64,
+    /// Whether the card's half precision is used where it has any. What is computed is the same.
+    pub half_precision: bool,
 }
 
 impl CardRules {
@@ -34,6 +36,7 @@ impl CardRules {
             adapters: Adapters::Real,
             falls_back: true,
             arena_bytes_max: ARENA_BYTES_MAX,
+            half_precision: true,
         }
     }
 
@@ -43,6 +46,7 @@ impl CardRules {
             adapters: Adapters::Any,
             falls_back: false,
             arena_bytes_max: ARENA_BYTES_MAX,
+            half_precision: true,
         }
     }
 }
@@ -77,7 +81,7 @@ impl Card {
     /// # Errors
     /// No adapter, or one that gives no device.
     pub fn open(rules: CardRules) -> Result<Arc<Self>, EngineError> {
-        match Device::open(rules.adapters) {
+        match Device::open(rules.adapters, rules.half_precision) {
             Ok(Some(device)) => Ok(Arc::new(Self {
                 rules,
                 device: Mutex::new(Arc::new(device)),
@@ -113,6 +117,11 @@ impl Card {
         self.destroy_device();
     }
 
+    /// Whether its half precision is used.
+    pub fn has_half_precision(&self) -> bool {
+        self.lock().half_precision
+    }
+
     pub(in crate::engine) fn falls_back(&self) -> bool {
         self.rules.falls_back
     }
@@ -138,7 +147,7 @@ impl Card {
         let opened = if self.unplugged.load(Ordering::Acquire) {
             Ok(None)
         } else {
-            Device::open(self.rules.adapters)
+            Device::open(self.rules.adapters, self.rules.half_precision)
         };
         let opened = opened.and_then(|found| {
             let found = found.ok_or_else(|| Lost("no adapter is left".to_owned()))?;

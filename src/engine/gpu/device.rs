@@ -30,13 +30,15 @@ pub struct Device {
     pub pipelines: Vec<wgpu::ComputePipeline>,
     /// Whether passes can be timed.
     pub timed: bool,
+    /// Whether stored halves are read by the card itself.
+    pub half_precision: bool,
     /// The first thing that went wrong.
     failure: Arc<Mutex<Option<String>>>,
 }
 
 impl Device {
     /// `Ok(None)`: there is no such adapter.
-    pub fn open(adapters: Adapters) -> Result<Option<Self>, Lost> {
+    pub fn open(adapters: Adapters, half_precision: bool) -> Result<Option<Self>, Lost> {
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::PRIMARY,
             ..wgpu::InstanceDescriptor::new_without_display_handle()
@@ -47,14 +49,14 @@ impl Device {
         };
         let info = adapter.get_info();
         let offered = adapter.limits();
-        let timed = adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        let mut wanted = wgpu::Features::TIMESTAMP_QUERY;
+        wanted.set(wgpu::Features::SHADER_F16, half_precision);
+        let features = adapter.features() & wanted;
+        let timed = features.contains(wgpu::Features::TIMESTAMP_QUERY);
+        let half_precision = features.contains(wgpu::Features::SHADER_F16);
         let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
             label: Some("surprised"),
-            required_features: if timed {
-                wgpu::Features::TIMESTAMP_QUERY
-            } else {
-                wgpu::Features::empty()
-            },
+            required_features: features,
             // Larger images where the card can; everything else fits what every card has.
             required_limits: wgpu::Limits {
                 max_storage_buffer_binding_size: offered.max_storage_buffer_binding_size,
@@ -83,11 +85,15 @@ impl Device {
             failed(error.to_string())
         }));
         let device = Self {
-            pipelines: PASSES.iter().map(|pass| pipeline(&device, pass)).collect(),
+            pipelines: PASSES
+                .iter()
+                .map(|pass| pipeline(&device, pass, half_precision))
+                .collect(),
             adapter: format!("{} ({:?}, {:?})", info.name, info.device_type, info.backend),
             device,
             queue,
             timed,
+            half_precision,
             failure,
         };
         device.check()?;
@@ -193,10 +199,11 @@ fn best(found: Vec<wgpu::Adapter>, adapters: Adapters) -> Option<wgpu::Adapter> 
         .map(|(_, adapter)| adapter)
 }
 
-fn pipeline(device: &wgpu::Device, pass: &Pass) -> wgpu::ComputePipeline {
+fn pipeline(device: &wgpu::Device, pass: &Pass, half_precision: bool) -> wgpu::ComputePipeline {
+    let native = pass.source_f16.filter(|_| half_precision);
     let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
         label: Some(pass.label),
-        source: wgpu::ShaderSource::Wgsl(pass.source.into()),
+        source: wgpu::ShaderSource::Wgsl(native.unwrap_or(pass.source).into()),
     });
     device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
         label: Some(pass.label),

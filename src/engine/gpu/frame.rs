@@ -7,14 +7,15 @@ use super::{
     Counters,
     arenas::Arenas,
     buffers::{
-        Bound, EXPOSURE_BYTES, PRIOR_BYTES, RECORD_BYTES, RecallBuffers, STAMPS_BYTES,
-        ScoreBuffers, SharedBuffers, fits,
+        Bound, ESTIMATE_BYTES, EXPOSURE_BYTES, PRIOR_BYTES, RECORD_BYTES, REPORT_HEAD_BYTES,
+        RecallBuffers, ScoreBuffers, SharedBuffers, fits,
     },
     card::Share,
     device::{Device, Lost},
-    layout::{Exposure, Frame, Rules, View},
+    layout::{Estimate, Exposure, Frame, Rules, View},
     passes::{BLOCK_MEANS, BLOCK_MEDIANS, EXPOSE, EXPOSE_PIXELS, GAIN, PASSES, SCORE_PIXELS},
     recording::{Passes, pass_seconds},
+    refine::refined,
     residency::Place,
 };
 use crate::{
@@ -24,12 +25,13 @@ use crate::{
         belief::{Belief, Record},
         camera::Intrinsics,
         frame::RgbImage,
-        pose::Pose,
+        pose::{Pose, PoseNoise},
         viewpoint::{Mesh, Viewpoint},
     },
     stages::{
         attend::BlockMap,
         interpolate::prior::{PLANES, Prior, put},
+        refine::{Refined, believed},
     },
 };
 
@@ -53,6 +55,8 @@ impl From<Lost> for Failure {
 /// What is wanted of a frame beside its evidence.
 #[derive(Debug, Clone, Copy)]
 pub struct Wanted {
+    /// Of the pose, where it is to be refined first.
+    pub noise: Option<PoseNoise>,
     pub evidence: Evidence,
     pub posterior: bool,
     /// The surprise map, if a block inside this border, pixels, has more nats than this.
@@ -60,6 +64,7 @@ pub struct Wanted {
 }
 
 pub struct Report {
+    pub refined: Refined,
     pub evidence: BlockMap,
     pub seen: usize,
 }
@@ -75,8 +80,6 @@ pub struct State {
     pub(super) sizes: Vec<(RecallBuffers, ScoreBuffers)>,
     /// Whether the last of `sizes` holds the maps of the last frame.
     has_maps: bool,
-    /// Whether it holds the image of the next.
-    pub(super) has_image: bool,
 }
 
 impl State {
@@ -96,12 +99,12 @@ impl State {
             views: views as u32,
             sizes: Vec::new(),
             has_maps: false,
-            has_image: false,
             device,
         }
     }
 
-    /// Compares an image with what the views expect. `score` gets the gain and what is wanted.
+    /// Compares an image with what the views expect, from the refined pose if that is wanted. `score` gets the gain and
+    /// what is wanted.
     #[allow(clippy::too_many_arguments)]
     pub fn compare(
         &mut self,
@@ -116,7 +119,6 @@ impl State {
         let frame = Frame::new(intrinsics.width, intrinsics.height, views.len());
         self.bring(views, counters)?;
         self.take_image(&frame, image, counters)?;
-        self.has_image = false;
         let placed = self.placed(
             views,
             |viewpoint| &viewpoint.mesh,
@@ -131,9 +133,21 @@ impl State {
             score: Some(buffers),
             level: 0,
         };
-        counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed);
+        let noise = wanted.noise.filter(|_| !views.is_empty()).map(believed);
+        let is_given = noise.is_some();
+        counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed, is_given);
 
         let mut passes = Passes::new(&self.device, self.queries.as_ref(), "frame");
+        if let Some(noise) = noise {
+            counters.uploaded_bytes += self.refine(
+                &mut passes,
+                bound,
+                views,
+                intrinsics,
+                world_from_camera,
+                noise,
+            );
+        }
         passes.recall(bound, &frame, views);
         passes.clear(&self.shared.histogram);
         let pixels = [u64::from(frame.width), u64::from(frame.height), 1];
@@ -154,10 +168,15 @@ impl State {
                 &buffers.block_medians
             }
         };
-        let evidence_at = EXPOSURE_BYTES + STAMPS_BYTES;
+        let stamps_at = EXPOSURE_BYTES + ESTIMATE_BYTES;
+        let evidence_at = REPORT_HEAD_BYTES;
         let posterior_at = evidence_at + 4 * frame.blocks();
-        passes.copy(&self.shared.exposure, &buffers.report, 0, EXPOSURE_BYTES);
-        passes.resolve(&self.shared.stamps, &buffers.report, EXPOSURE_BYTES);
+        let SharedBuffers {
+            exposure, estimate, ..
+        } = &self.shared;
+        passes.copy(exposure, &buffers.report, 0, EXPOSURE_BYTES);
+        passes.copy(estimate, &buffers.report, EXPOSURE_BYTES, ESTIMATE_BYTES);
+        passes.resolve(&self.shared.stamps, &buffers.report, stamps_at);
         passes.copy(evidence, &buffers.report, evidence_at, 4 * frame.blocks());
         let mut bytes = posterior_at;
         if wanted.posterior {
@@ -173,15 +192,23 @@ impl State {
         let run = passes.submit();
         counters.passes += run.labels.len() as u64;
         let read = self.device.read(&buffers.report, bytes, run.index)?;
+        counters.read_backs += 1;
         counters.read_back_bytes += bytes;
 
         let (head, posterior) = read.split_at(posterior_at as usize);
         let exposure: Exposure = bytemuck::pod_read_unaligned(&head[..size_of::<Exposure>()]);
         score.gain = exposure.gain;
+        let refined = match noise {
+            Some(_) => {
+                let estimate = &head[EXPOSURE_BYTES as usize..stamps_at as usize];
+                let estimate: Estimate = bytemuck::pod_read_unaligned(estimate);
+                refined(&estimate, world_from_camera)
+            }
+            None => Refined::unchanged(*world_from_camera),
+        };
         if self.queries.is_some() {
-            let stamps = &head[EXPOSURE_BYTES as usize..evidence_at as usize];
-            let seconds = pass_seconds(&self.device, &run.labels, stamps);
-            counters.pass_seconds.extend(seconds);
+            let stamps = &head[stamps_at as usize..evidence_at as usize];
+            counters.pass_seconds = pass_seconds(&self.device, &run.labels, stamps);
         }
         let evidence = BlockMap {
             width: frame.blocks_wide as usize,
@@ -199,10 +226,12 @@ impl State {
             .any(|(_, _, nats)| nats > threshold)
         {
             score.surprise = self.plane(&buffers.surprise_map, 4 * frame.pixels())?;
+            counters.read_backs += 1;
             counters.read_back_bytes += 4 * frame.pixels();
         }
         self.has_maps = true;
         Ok(Report {
+            refined,
             evidence,
             seen: exposure.seen as usize,
         })
@@ -236,7 +265,7 @@ impl State {
             score: None,
             level: 0,
         };
-        counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed);
+        counters.uploaded_bytes += self.shared.upload(&self.device, &frame, &placed, false);
         let mut passes = Passes::new(&self.device, None, "recall");
         passes.recall(bound, &frame, views);
         counters.passes += passes.submit().labels.len() as u64;
@@ -302,11 +331,7 @@ impl State {
     }
 
     /// Brings the views that are not there.
-    pub(super) fn bring(
-        &mut self,
-        views: &[RecallView],
-        counters: &mut Counters,
-    ) -> Result<(), Failure> {
+    fn bring(&mut self, views: &[RecallView], counters: &mut Counters) -> Result<(), Failure> {
         let evicted = self.arenas.residency.evicted();
         if !self.bring_all(views, counters) {
             // There may be room, but in pieces.
@@ -366,7 +391,7 @@ impl State {
 
     /// Puts the buffers of an image's size at the end of `sizes`, with the image in them. The maps of the frame before
     /// are gone then.
-    pub(super) fn take_image(
+    fn take_image(
         &mut self,
         frame: &Frame,
         image: &RgbImage,
@@ -380,9 +405,6 @@ impl State {
         let is_same_size = |(recall, _): &(RecallBuffers, ScoreBuffers)| {
             (recall.width, recall.height) == (frame.width, frame.height)
         };
-        if self.has_image && self.sizes.last().is_some_and(is_same_size) {
-            return Ok(());
-        }
         let known = self
             .sizes
             .iter()
@@ -402,10 +424,7 @@ impl State {
         };
         self.device.upload(&buffers.1.image, 0, &image.data);
         counters.uploaded_bytes += image.data.len() as u64;
-        // A new frame's.
-        counters.pass_seconds.clear();
         self.sizes.push(buffers);
-        self.has_image = true;
         Ok(())
     }
 

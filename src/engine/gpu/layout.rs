@@ -190,10 +190,11 @@ pub struct Level {
     /// Correlated pixels count less.
     pub inverse_discount: f32,
     /// Of the image, pixels.
-    pub image_focal: f32,
+    pub image_focal: [f32; 2],
+    pub image_center: [f32; 2],
     pub position_sd_m: f32,
     pub rotation_sd_rad: f32,
-    _padding: u32,
+    _padding: [u32; 2],
 }
 
 impl Level {
@@ -221,10 +222,11 @@ impl Level {
                 finer_first,
                 image_width: intrinsics.width as u32,
                 inverse_discount: (1.0 / discount(intrinsics.pixels(), index)) as f32,
-                image_focal: intrinsics.fx as f32,
+                image_focal: [intrinsics.fx as f32, intrinsics.fy as f32],
+                image_center: [intrinsics.cx as f32, intrinsics.cy as f32],
                 position_sd_m: noise.position_m as f32,
                 rotation_sd_rad: noise.rotation_rad as f32,
-                _padding: 0,
+                _padding: [0; 2],
             };
             (finer_width, finer_first) = (level.width, first);
             first += level.pixels() as u32;
@@ -250,5 +252,6 @@ pub struct Estimate {
     pub level_count: u32,
     /// Comparable pixels of the finest level.
     pub point_count: u32,
-    _padding: u32,
+    /// Whether it is better than the given pose; 0 or 1.
+    pub accepted: u32,
 }

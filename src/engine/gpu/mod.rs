@@ -5,14 +5,13 @@
 //! flight: its report is awaited, because the next frame's prior depends on what is learnt. The device and its pipelines
 //! are those of all places.
 //!
-//! Two read-backs a frame: the refined pose is awaited before the comparison is recorded, because the views of the
-//! comparison are chosen by it from the whole memory, and those that are not resident are brought. The image goes up
-//! once.
+//! One submission and one read-back a frame: the refined pose is judged on the device, which places the views by it. The
+//! image goes up once. Where something surprises, its map is read as well.
 //!
-//! Passes a frame, whatever the number of views: 13. Refinement has 5: project coarse depth, project coarse triangle,
-//! expect, halve (3 dispatches) and refine (54: depths and begin, twice accumulate and judge, and magnitudes, accumulate
-//! and step four times on each of four levels; coarse ones that the pose's noise does not call for do nothing). The
-//! comparison has 8: project depth, project triangle, merge, expose, gain, score, block means, and block medians where
+//! Passes a frame, whatever the number of views: 14. Refinement has 6: project coarse depth, project coarse triangle,
+//! expect, halve (3 dispatches), refine (54: depths and begin, twice accumulate and judge, and magnitudes, accumulate
+//! and step four times on each of four levels; coarse ones that the pose's noise does not call for do nothing), and place.
+//! The comparison has 8: project depth, project triangle, merge, expose, gain, score, block means, and block medians where
 //! the evidence is their median. Bytes a frame of P pixels, V views of P pixels:
 //!
 //! | over the bus | bytes | 320x240 |
@@ -20,8 +19,7 @@
 //! | up: image; depth, coarse depth and luminance of what is learnt | 3 P + 7 P | 0.77 MB |
 //! | up: a view that is not resident | 39 P | 3.0 MB |
 //! | up: poses, sizes, levels | < 3 kB | 3 kB |
-//! | down: refined pose, its time stamps | 352 | 0.4 kB |
-//! | down: evidence, exposure, time stamps | P / 4 + 304 | 20 kB |
+//! | down: evidence, exposure, refined pose, time stamps | P / 4 + 384 | 20 kB |
 //! | down, if it is learnt: the posterior | 32 P | 2.46 MB |
 //! | down, if something surprises: the map | 4 P | 0.31 MB |
 //! | down, if somebody wants the maps | 100 P | 7.7 MB |
@@ -37,7 +35,7 @@
 //! | the pyramid read twice a step, neighbours from the cache: 16 B, 4 steps, P / 3 pixels, and by the judges | 51 P |
 //!
 //! A model, not a measurement: with V = 7 that is 848 P, 65 MB at 320x240 and 260 MB at 640x480. A card of 400 GB/s that
-//! reaches half of it needs 0.3 ms and 1.3 ms, and 0.3 ms beside if each of the 68 dispatches waits 5 us for the one
+//! reaches half of it needs 0.3 ms and 1.3 ms, and 0.3 ms beside if each of the 69 dispatches waits 5 us for the one
 //! before; a bus of 12 GB/s adds 0.27 ms and 1.1 ms where everything is learnt.
 
 mod arenas;
@@ -72,20 +70,12 @@ use self::{
 use super::{
     Answer, Compared, EngineError, Question, compare_on_processor,
     cpu::{CpuEngine, RecallView, Score},
-    refine_on_processor,
 };
 use crate::{
     config::Settings,
     isa::Isa,
-    model::{
-        camera::Intrinsics,
-        pose::{Pose, PoseNoise},
-        viewpoint::Viewpoint,
-    },
-    stages::{
-        interpolate::prior::Prior,
-        refine::{PoseRefiner, Refined},
-    },
+    model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
+    stages::interpolate::prior::Prior,
 };
 
 /// What was moved and done, since the engine was made.
@@ -96,6 +86,8 @@ pub struct Counters {
     pub on_processor: u64,
     pub passes: u64,
     pub uploaded_bytes: u64,
+    /// Times that a frame waited for the device.
+    pub read_backs: u64,
     /// For reports and priors; not the maps that somebody wanted.
     pub read_back_bytes: u64,
     /// Viewpoints that had to be uploaded, and that had to make room.
@@ -163,29 +155,6 @@ impl GpuEngine {
         CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
     }
 
-    /// The pose of a frame that is compared next, from its nearest views. `refiner` is for what does not fit the device.
-    pub(super) fn refine(
-        &mut self,
-        question: &Question,
-        noise: PoseNoise,
-        refiner: &mut PoseRefiner,
-    ) -> Result<Refined, EngineError> {
-        let refined = self.persevere(|state, counters| {
-            state.refine(
-                question.views,
-                question.intrinsics,
-                question.world_from_camera,
-                question.image,
-                noise,
-                counters,
-            )
-        })?;
-        Ok(refined.unwrap_or_else(|| {
-            self.counters.on_processor += 1;
-            refine_on_processor(&self.processor, question, noise, refiner)
-        }))
-    }
-
     pub(super) fn compare(
         &mut self,
         question: &Question,
@@ -193,6 +162,7 @@ impl GpuEngine {
         answer: &mut Answer,
     ) -> Result<Compared, EngineError> {
         let wanted = Wanted {
+            noise: question.noise,
             evidence: self.settings.evidence,
             posterior: learn,
             surprise_from: (self.settings.border_px, self.settings.surprise_threshold),
@@ -217,10 +187,12 @@ impl GpuEngine {
                 question,
                 evidence,
                 answer,
+                &mut || {},
             ));
         };
         *answer.evidence = report.evidence;
         Ok(Compared {
+            refined: report.refined,
             seen: report.seen,
             maps_read: false,
         })

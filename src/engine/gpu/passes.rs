@@ -33,6 +33,8 @@ pub enum Slot {
     Pyramid,
     PartialSums,
     Estimate,
+    /// As [`Self::Views`], before a camera that is where its pose says.
+    GivenViews,
 }
 
 impl Slot {
@@ -64,6 +66,7 @@ impl Slot {
             Self::Pyramid => "pyramid",
             Self::PartialSums => "partial_sums",
             Self::Estimate => "estimate",
+            Self::GivenViews => "given_views",
         }
     }
 }
@@ -73,6 +76,8 @@ impl Slot {
 pub struct Pass {
     pub label: &'static str,
     pub source: &'static str,
+    /// The same with half precision, for cards that have it.
+    pub source_f16: Option<&'static str>,
     pub entry: &'static str,
     pub workgroup: [u32; 3],
     /// Binding numbers of group 0.
@@ -96,7 +101,18 @@ const PREDICT: &str = shader!(
 );
 const COMPARE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/compare.wgsl");
 const SOLVE: &str = shader!("layout.wgsl", "refine.wgsl", "passes/solve.wgsl");
+const PLACE_VIEWS: &str = shader!("layout.wgsl", "refine.wgsl", "passes/place.wgsl");
 const MERGE: &str = shader!(
+    "layout.wgsl",
+    "belief.wgsl",
+    "records.wgsl",
+    "project.wgsl",
+    "merge.wgsl",
+    "passes/merge.wgsl"
+);
+/// An extension is enabled before anything else.
+const MERGE_F16: &str = shader!(
+    "records_f16.wgsl",
     "layout.wgsl",
     "belief.wgsl",
     "project.wgsl",
@@ -173,6 +189,8 @@ pub const ACCUMULATE: usize = 14;
 pub const BEGIN: usize = 15;
 pub const STEP: usize = 16;
 pub const JUDGE: usize = 17;
+/// One a view.
+pub const PLACE: usize = 18;
 
 /// Pixels of one invocation of [`EXPOSE`].
 pub const EXPOSE_PIXELS: u32 = 32;
@@ -186,10 +204,11 @@ pub const SUMS: u32 = 47;
 pub const HISTOGRAM_WORDS: u64 = 2048 + 1;
 
 /// What compares a frame, in its order, and then what refines its pose before that.
-pub const PASSES: [Pass; 18] = [
+pub const PASSES: [Pass; 19] = [
     Pass {
         label: "project depth",
         source: PROJECT,
+        source_f16: None,
         entry: "project_depth",
         workgroup: [8, 8, 1],
         bindings: DRAWN,
@@ -197,6 +216,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "project triangle",
         source: PROJECT,
+        source_f16: None,
         entry: "project_triangle",
         workgroup: [8, 8, 1],
         bindings: DRAWN,
@@ -204,6 +224,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "merge",
         source: MERGE,
+        source_f16: Some(MERGE_F16),
         entry: "merge",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -223,6 +244,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "expose",
         source: EXPOSURE,
+        source_f16: None,
         entry: "expose",
         workgroup: [256, 1, 1],
         bindings: &[
@@ -236,6 +258,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "gain",
         source: EXPOSURE,
+        source_f16: None,
         entry: "gain",
         workgroup: [256, 1, 1],
         bindings: &[(1, Slot::Rules), (5, Slot::Histogram), (6, Slot::Exposure)],
@@ -243,6 +266,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "score",
         source: SCORE,
+        source_f16: None,
         entry: "score",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -261,6 +285,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "block means",
         source: ATTEND,
+        source_f16: None,
         entry: "means",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -272,6 +297,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "block medians",
         source: ATTEND,
+        source_f16: None,
         entry: "median",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -283,6 +309,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "project coarse depth",
         source: PROJECT,
+        source_f16: None,
         entry: "project_depth",
         workgroup: [8, 8, 1],
         bindings: DRAWN_COARSE,
@@ -290,6 +317,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "project coarse triangle",
         source: PROJECT,
+        source_f16: None,
         entry: "project_triangle",
         workgroup: [8, 8, 1],
         bindings: DRAWN_COARSE,
@@ -297,6 +325,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "expect",
         source: PREDICT,
+        source_f16: None,
         entry: "expect",
         workgroup: [8, 8, 1],
         bindings: &[
@@ -314,6 +343,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "halve",
         source: PREDICT,
+        source_f16: None,
         entry: "halve",
         workgroup: [8, 8, 1],
         bindings: &[(2, Slot::Level), (8, Slot::Pyramid)],
@@ -321,6 +351,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "depths",
         source: COMPARE,
+        source_f16: None,
         entry: "depths",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[(0, Slot::Level), (2, Slot::Pyramid), (3, Slot::Histogram)],
@@ -328,6 +359,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "magnitudes",
         source: COMPARE,
+        source_f16: None,
         entry: "magnitudes",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[
@@ -340,6 +372,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "accumulate",
         source: COMPARE,
+        source_f16: None,
         entry: "accumulate",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[
@@ -353,6 +386,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "begin",
         source: SOLVE,
+        source_f16: None,
         entry: "begin",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: &[(0, Slot::Level), (1, Slot::Estimate), (2, Slot::Histogram)],
@@ -360,6 +394,7 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "step",
         source: SOLVE,
+        source_f16: None,
         entry: "step",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: SOLVED,
@@ -367,8 +402,23 @@ pub const PASSES: [Pass; 18] = [
     Pass {
         label: "judge",
         source: SOLVE,
+        source_f16: None,
         entry: "judge",
         workgroup: [REFINE_THREADS, 1, 1],
         bindings: SOLVED,
+    },
+    Pass {
+        label: "place",
+        source: PLACE_VIEWS,
+        source_f16: None,
+        entry: "place",
+        workgroup: [16, 1, 1],
+        bindings: &[
+            (0, Slot::Frame),
+            (1, Slot::Level),
+            (2, Slot::Estimate),
+            (3, Slot::GivenViews),
+            (4, Slot::Views),
+        ],
     },
 ];

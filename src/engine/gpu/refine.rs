@@ -1,52 +1,45 @@
 //! Pose refinement on the device: the expected image from the nearest views' coarse meshes, its pyramid, and all steps of
-//! all levels, solved there; the estimate is read when they are done.
+//! all levels, solved and judged there; the views of the comparison that follows are placed by the estimate, which is read
+//! with the report.
 //!
 //! How many levels there are is decided on the device, too: steps of the others are recorded and do nothing.
 
 use super::{
-    Counters,
-    buffers::{Bound, ESTIMATE_BYTES, STAMPS_BYTES},
-    frame::{Failure, State},
+    buffers::Bound,
+    frame::State,
     layout::{Estimate, Frame, Level},
     passes::{
-        ACCUMULATE, BEGIN, DEPTHS, EXPECT, HALVE, JUDGE, MAGNITUDES, PROJECT_COARSE_DEPTH,
+        ACCUMULATE, BEGIN, DEPTHS, EXPECT, HALVE, JUDGE, MAGNITUDES, PLACE, PROJECT_COARSE_DEPTH,
         PROJECT_COARSE_TRIANGLE, REFINE_PIXELS, REFINE_THREADS, STEP,
     },
-    recording::{Dispatch, Passes, pass_seconds},
+    recording::{Dispatch, Passes},
     residency::COARSE_PIXELS,
 };
 use crate::{
     engine::cpu::RecallView,
     model::{
         camera::Intrinsics,
-        frame::RgbImage,
         pose::{Pose, PoseNoise},
     },
-    stages::refine::{ITERATIONS, PIXELS_MIN, REFINE_VIEWS, Refined, accepted, believed},
+    stages::refine::{ITERATIONS, REFINE_VIEWS, Refined},
 };
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
 impl State {
-    /// As [`crate::stages::refine::PoseRefiner::refine`]. The image stays for the comparison that follows.
-    pub fn refine(
-        &mut self,
+    /// Records what [`crate::stages::refine::PoseRefiner::refine`] does, for a frame with these views, and places them.
+    /// Returns how many bytes went up.
+    pub(super) fn refine<'a>(
+        &'a self,
+        passes: &mut Passes<'a>,
+        bound: Bound<'a>,
         views: &[RecallView],
         intrinsics: &Intrinsics,
         world_from_camera: &Pose,
-        image: &RgbImage,
         noise: PoseNoise,
-        counters: &mut Counters,
-    ) -> Result<Refined, Failure> {
-        if views.is_empty() {
-            return Ok(Refined::unchanged(*world_from_camera));
-        }
+    ) -> u64 {
+        let view_count = views.len() as u64;
         let views = &views[..views.len().min(REFINE_VIEWS)];
-        let noise = believed(noise);
-        let whole = Frame::new(intrinsics.width, intrinsics.height, views.len());
-        self.bring(views, counters)?;
-        self.has_image = false;
-        self.take_image(&whole, image, counters)?;
         let camera = intrinsics.half();
         let half = Frame::new(camera.width, camera.height, views.len());
         let mut placed = self.placed(
@@ -59,19 +52,10 @@ impl State {
             view.first /= COARSE_PIXELS as u32;
         }
         let levels = Level::pyramid(intrinsics, noise);
-        counters.uploaded_bytes += self
+        let uploaded_bytes = self
             .shared
             .upload_coarse(&self.device, &half, &placed, &levels);
-
-        let (recall, score) = self.sizes.last().expect("the image was just taken");
-        let at = |level: usize| Bound {
-            shared: &self.shared,
-            arenas: &self.arenas,
-            recall,
-            score: Some(score),
-            level,
-        };
-        let mut passes = Passes::new(&self.device, self.queries.as_ref(), "refine");
+        let at = |level: usize| Bound { level, ..bound };
         passes.clear(&self.shared.histogram);
         let meshes = views.iter().map(|view| &view.viewpoint.coarse.mesh);
         passes.project(
@@ -109,44 +93,20 @@ impl State {
         }
         steps.extend(judge);
         passes.run_all("refine", &steps);
-
-        let refined = &self.shared.refined;
-        passes.copy(&self.shared.estimate, refined, 0, ESTIMATE_BYTES);
-        passes.resolve(&self.shared.stamps, refined, ESTIMATE_BYTES);
-        let run = passes.submit();
-        counters.passes += run.labels.len() as u64;
-        let bytes = ESTIMATE_BYTES + STAMPS_BYTES;
-        let read = self.device.read(refined, bytes, run.index)?;
-        counters.read_back_bytes += bytes;
-        let (estimate, stamps) = read.split_at(ESTIMATE_BYTES as usize);
-        if self.queries.is_some() {
-            counters.pass_seconds = pass_seconds(&self.device, &run.labels, stamps);
-        }
-        let estimate: Estimate = bytemuck::pod_read_unaligned(estimate);
-        Ok(judged(&estimate, world_from_camera, noise)
-            .unwrap_or_else(|| Refined::unchanged(*world_from_camera)))
+        passes.run(PLACE, at(0), [view_count, 1, 1]);
+        uploaded_bytes
     }
 }
 
 /// The refined pose, where refinement helps.
-fn judged(estimate: &Estimate, world_from_camera: &Pose, noise: PoseNoise) -> Option<Refined> {
-    if (estimate.point_count as usize) < PIXELS_MIN {
-        return None;
+pub(super) fn refined(estimate: &Estimate, world_from_camera: &Pose) -> Refined {
+    if estimate.accepted == 0 {
+        return Refined::unchanged(*world_from_camera);
     }
-    let mean = |[sum, count]: [f32; 2]| match count {
-        0.0 => f64::INFINITY,
-        count => f64::from(sum / count),
-    };
     let [x, y, z, w] = estimate.rotation.map(f64::from);
     let given_from_real = Pose::from_parts(
         Translation3::from(estimate.translation.map(f64::from)),
         UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)),
     );
-    accepted(
-        world_from_camera,
-        &given_from_real,
-        noise,
-        mean(estimate.mismatch_before),
-        mean(estimate.mismatch),
-    )
+    Refined::moved(world_from_camera, &given_from_real)
 }

@@ -7,11 +7,14 @@ use std::{
     time::{Duration, Instant},
 };
 
+use bytes::Bytes;
 use serde::Serialize;
 use tokio::{runtime::Handle, sync::Notify};
 
 use super::{
-    Store, form, keeper, lease,
+    Store,
+    events::EventNotes,
+    form, keeper, lease,
     loader::{self, LOADS_MAX},
     shelf::Shelf,
     way::{self, Passed},
@@ -31,7 +34,7 @@ use crate::{
 /// How far ahead of a robot viewpoints are loaded, and how many more than a frame recalls.
 const AHEAD_S: [f64; 2] = [0.5, 1.0];
 const AHEAD_FACTOR: usize = 3;
-/// Refinement may move a pose: somewhat more than what its frame recalls is brought.
+/// A robot that turns back needs at once what lies behind it: more than what a frame recalls is brought.
 const NEED_FACTOR: usize = 2;
 /// A frame or question waits no longer for what it needs; it goes on with what is there.
 const BRING_WITHIN: Duration = Duration::from_secs(2);
@@ -202,6 +205,7 @@ pub(super) struct State {
     pub modes_said: Modes,
     /// The worker knows what these come to.
     pub modes_told: bool,
+    pub events: EventNotes,
     /// To be loaded, the next first.
     pub wanted: VecDeque<u64>,
     /// Being loaded.
@@ -228,7 +232,7 @@ impl State {
     /// Changes that are not stored yet.
     pub fn unstored(&self) -> usize {
         let modes = self.role == Role::Writer && !self.modes_said.is_empty();
-        self.pending.len() + self.writing + usize::from(modes)
+        self.pending.len() + self.writing + usize::from(modes) + self.events.unstored()
     }
 
     /// Whether the lease of this epoch still allows to write.
@@ -399,6 +403,20 @@ impl PlaceStore {
         state.modes_said = state.modes_said.then(modes);
         state.modes_told = false;
         self.shared.for_writer.notify_one();
+    }
+
+    /// Keeps the state of an event, or keeps it no longer; nothing where another service writes the place.
+    pub fn keep_event(&self, id: u64, content: Option<Vec<u8>>) {
+        let mut state = self.shared.lock();
+        if state.role == Role::Writer {
+            state.events.keep(id, content.map(Bytes::from));
+            self.shared.for_writer.notify_one();
+        }
+    }
+
+    /// Stored events that were not taken yet.
+    pub fn take_events(&self) -> Vec<(u64, Bytes)> {
+        std::mem::take(&mut self.shared.lock().events.read)
     }
 
     /// Tells the memory what is new and takes what has changed in it. To be called after every frame, and when woken.

@@ -4,6 +4,7 @@
 //! PLACE/viewpoints/ID-EPOCH-REVISION    one object a viewpoint (see `form`); numbers in hexadecimal
 //! PLACE/lease/EPOCH                     who writes the place (see `lease`)
 //! PLACE/modes/EPOCH-REVISION            what was said about modes (see `modes`)
+//! PLACE/events/ID-EPOCH-REVISION        what is kept of an event (see `events`)
 //! PLACE/damaged/...                     what could not be read, under the name it had
 //! PLACE/lock                            on disk only: locked by the process that writes the place
 //! ```
@@ -29,6 +30,7 @@ use crate::memory::Version;
 pub const VIEWPOINTS: &str = "viewpoints";
 const LEASE: &str = "lease";
 const MODES: &str = "modes";
+const EVENTS: &str = "events";
 const DAMAGED: &str = "damaged";
 const LOCK: &str = "lock";
 
@@ -68,10 +70,18 @@ impl Shelf {
     }
 
     pub fn viewpoint(&self, id: u64, version: Version) -> Path {
+        self.state(VIEWPOINTS, id, version)
+    }
+
+    pub fn event(&self, id: u64, version: Version) -> Path {
+        self.state(EVENTS, id, version)
+    }
+
+    fn state(&self, folder: &str, id: u64, version: Version) -> Path {
         let Version { epoch, revision } = version;
         self.at
             .clone()
-            .join(VIEWPOINTS)
+            .join(folder)
             .join(format!("{id:016x}-{epoch:08x}-{revision:016x}"))
     }
 
@@ -120,7 +130,12 @@ impl Shelf {
 
     /// The whole object; `None` if it is larger than `bytes_max`, which is not read.
     pub async fn get(&self, id: u64, version: Version, bytes_max: u64) -> Result<Option<Bytes>> {
-        let object = self.objects.get(&self.viewpoint(id, version)).await?;
+        self.get_whole(&self.viewpoint(id, version), bytes_max)
+            .await
+    }
+
+    async fn get_whole(&self, path: &Path, bytes_max: u64) -> Result<Option<Bytes>> {
+        let object = self.objects.get(path).await?;
         if object.meta.size > bytes_max {
             return Ok(None);
         }
@@ -165,11 +180,7 @@ impl Shelf {
 
     /// `None` if it is larger than `bytes_max`, which is not read.
     pub async fn get_modes(&self, version: Version, bytes_max: u64) -> Result<Option<Bytes>> {
-        let object = self.objects.get(&self.modes(version)).await?;
-        if object.meta.size > bytes_max {
-            return Ok(None);
-        }
-        object.bytes().await.map(Some)
+        self.get_whole(&self.modes(version), bytes_max).await
     }
 
     pub async fn put_modes(&self, version: Version, object: Bytes) -> Result<()> {
@@ -178,10 +189,45 @@ impl Shelf {
 
     pub async fn delete_modes(&self, versions: &[Version]) -> Result<()> {
         for &version in versions {
-            match self.objects.delete(&self.modes(version)).await {
-                Ok(()) | Err(Error::NotFound { .. }) => {}
-                Err(error) => return Err(error),
-            }
+            self.delete_one(&self.modes(version)).await?;
+        }
+        Ok(())
+    }
+
+    async fn delete_one(&self, path: &Path) -> Result<()> {
+        match self.objects.delete(path).await {
+            Ok(()) | Err(Error::NotFound { .. }) => Ok(()),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// All states of all events.
+    pub async fn list_events(&self) -> Result<Vec<(u64, Version)>> {
+        let objects = self.objects.list(Some(&self.at.clone().join(EVENTS)));
+        let states = objects.try_filter_map(async |object| {
+            let name = object.location.filename();
+            Ok(name.and_then(parse))
+        });
+        states.try_collect().await
+    }
+
+    /// `None` if it is larger than `bytes_max`, which is not read.
+    pub async fn get_event(
+        &self,
+        id: u64,
+        version: Version,
+        bytes_max: u64,
+    ) -> Result<Option<Bytes>> {
+        self.get_whole(&self.event(id, version), bytes_max).await
+    }
+
+    pub async fn put_event(&self, id: u64, version: Version, object: Bytes) -> Result<()> {
+        self.put_once(&self.event(id, version), object).await
+    }
+
+    pub async fn delete_events(&self, states: &[(u64, Version)]) -> Result<()> {
+        for &(id, version) in states {
+            self.delete_one(&self.event(id, version)).await?;
         }
         Ok(())
     }
@@ -195,10 +241,7 @@ impl Shelf {
     /// Deletes states of viewpoints; those that are not there are none. Deleted for good where `synced`.
     pub async fn delete(&self, states: &[(u64, Version)], synced: bool) -> Result<()> {
         for &(id, version) in states {
-            match self.objects.delete(&self.viewpoint(id, version)).await {
-                Ok(()) | Err(Error::NotFound { .. }) => {}
-                Err(error) => return Err(error),
-            }
+            self.delete_one(&self.viewpoint(id, version)).await?;
         }
         if synced && let Some(folder) = &self.folder {
             let folder = folder.join(VIEWPOINTS);
@@ -216,6 +259,12 @@ impl Shelf {
         let path = self.modes(version);
         let name = path.filename().unwrap_or("nameless");
         self.rename_aside(&path, &format!("modes-{name}")).await
+    }
+
+    pub async fn set_event_aside(&self, id: u64, version: Version) -> Result<Path> {
+        let path = self.event(id, version);
+        let name = path.filename().unwrap_or("nameless");
+        self.rename_aside(&path, &format!("event-{name}")).await
     }
 
     pub async fn move_aside(&self, path: &Path) -> Result<Path> {
@@ -285,10 +334,7 @@ impl Shelf {
     pub async fn delete_leases_before(&self, epoch: u64) -> Result<()> {
         for earlier in self.lease_epochs().await? {
             if earlier < epoch {
-                match self.objects.delete(&self.lease(earlier)).await {
-                    Ok(()) | Err(Error::NotFound { .. }) => {}
-                    Err(error) => return Err(error),
-                }
+                self.delete_one(&self.lease(earlier)).await?;
             }
         }
         Ok(())
@@ -300,22 +346,23 @@ impl Shelf {
         let Some(folder) = &self.folder else {
             return Ok(());
         };
-        let folder = folder.join(VIEWPOINTS);
-        on_disk(move || {
-            let entries = match std::fs::read_dir(&folder) {
-                Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
-                entries => entries?,
-            };
-            for entry in entries {
-                let entry = entry?;
-                if entry.file_name().to_string_lossy().contains('#') {
-                    std::fs::remove_file(entry.path())?;
-                }
-            }
-            Ok(())
-        })
-        .await
+        let folders = [VIEWPOINTS, MODES, EVENTS].map(|name| folder.join(name));
+        on_disk(move || folders.iter().try_for_each(|folder| sweep_folder(folder))).await
     }
+}
+
+fn sweep_folder(folder: &std::path::Path) -> std::io::Result<()> {
+    let entries = match std::fs::read_dir(folder) {
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        entries => entries?,
+    };
+    for entry in entries {
+        let entry = entry?;
+        if entry.file_name().to_string_lossy().contains('#') {
+            std::fs::remove_file(entry.path())?;
+        }
+    }
+    Ok(())
 }
 
 async fn on_disk(work: impl FnOnce() -> std::io::Result<()> + Send + 'static) -> Result<()> {

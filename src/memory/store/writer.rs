@@ -1,13 +1,14 @@
 //! Writes what has changed, some time after it changed: newest states only, several at once. What is said about modes is
 //! written at once.
 
-use std::{sync::Arc, time::Instant};
+use std::{collections::BTreeMap, sync::Arc, time::Instant};
 
+use bytes::Bytes;
 use futures_util::{StreamExt, stream};
 use tokio::{task::spawn_blocking, time};
 
 use super::{
-    Backoff,
+    Backoff, events,
     form::{self, Label},
     modes,
     place::{Known, News, Pending, Role, Shared},
@@ -29,6 +30,10 @@ enum Due {
     Modes {
         version: Version,
         said: Modes,
+    },
+    Events {
+        epoch: u64,
+        changes: BTreeMap<u64, Option<Bytes>>,
     },
     At(Instant),
     Nothing,
@@ -57,18 +62,27 @@ pub async fn write(shared: Arc<Shared>) {
             }
             Due::Modes { version, said } => {
                 let written = write_modes(&shared, version, said).await;
-                let trouble = written.err().map(|error| error.to_string());
-                let failed = trouble.is_some();
-                shared.trouble(WRITING, trouble);
-                shared.tell_worker();
-                if failed {
-                    shared.lock().counters.write_failures += 1;
-                    time::sleep(backoff.next()).await;
-                } else {
-                    backoff = Backoff::default();
-                }
+                note_written(&shared, written, &mut backoff).await;
+            }
+            Due::Events { epoch, changes } => {
+                let written = events::write(&shared, epoch, changes).await;
+                note_written(&shared, written, &mut backoff).await;
             }
         }
+    }
+}
+
+/// Says how it went, and waits after a failure.
+async fn note_written(shared: &Shared, written: shelf::Result<()>, backoff: &mut Backoff) {
+    let trouble = written.err().map(|error| error.to_string());
+    let failed = trouble.is_some();
+    shared.trouble(WRITING, trouble);
+    shared.tell_worker();
+    if failed {
+        shared.lock().counters.write_failures += 1;
+        time::sleep(backoff.next()).await;
+    } else {
+        *backoff = Backoff::default();
     }
 }
 
@@ -84,7 +98,8 @@ fn due(shared: &Shared) -> Due {
             said: state.modes_said.clone(),
         };
     }
-    let oldest = state.pending.values().map(|pending| pending.since).min();
+    let pending = state.pending.values().map(|pending| pending.since);
+    let oldest = pending.chain(state.events.since).min();
     let Some(oldest) = oldest else {
         return if state.closing {
             Due::End
@@ -100,6 +115,11 @@ fn due(shared: &Shared) -> Due {
     let at = oldest + shared.options.write_behind / 2;
     if !state.closing && Instant::now() < at {
         return Due::At(at);
+    }
+    if state.events.since.take().is_some() {
+        let changes = std::mem::take(&mut state.events.pending);
+        state.events.writing = changes.len();
+        return Due::Events { epoch, changes };
     }
     let changes: Vec<(u64, Pending)> = std::mem::take(&mut state.pending).into_iter().collect();
     state.writing = changes.len();

@@ -229,6 +229,35 @@ impl Events {
         changed
     }
 
+    /// Goes on with an event that was told of before, as after a restart: what it looked like and who reports it under
+    /// which id is found out anew. Nothing happens for one that is followed or has ended.
+    pub fn resume(&mut self, event: Event) {
+        let is_known = |followed: &Followed| followed.event.id == event.id;
+        let told = self.followed.iter().filter(|f| f.told.is_some()).count();
+        self.last_id = self.last_id.max(event.id);
+        if !event.is_open() || self.followed.iter().any(is_known) || told >= OPEN_MAX {
+            return;
+        }
+        let points = event.unseen_points.iter().map(|&point| (point, false));
+        self.followed.push(Followed {
+            told: Some(Told {
+                stamp_ns: event.last_seen_ns,
+                peak: event.peak_surprise,
+                robots: event.robots.len(),
+            }),
+            born: self.frames,
+            last_frame: self.frames,
+            clear: 0,
+            last_center: event.center_in_world,
+            half_size_px: half_size_px(event.last.pixel_box),
+            best: Some((true, event.peak_surprise)),
+            known_by: Vec::new(),
+            patches: Vec::new(),
+            points: points.collect(),
+            event,
+        });
+    }
+
     /// The id of the event or candidate that the region belongs to.
     fn sight_region(&mut self, look: &Look, region: &Region, settings: &Settings) -> u64 {
         let placed = region
@@ -246,14 +275,7 @@ impl Events {
             followed.last_center = Some(center);
         }
         followed.known_by(look.source, region.id);
-        let side = |min: u32, max: u32| f64::from(max.saturating_sub(min));
-        let PixelBox {
-            x_min,
-            y_min,
-            x_max,
-            y_max,
-        } = region.pixel_box;
-        followed.half_size_px = side(x_min, x_max).max(side(y_min, y_max)) / 2.0;
+        followed.half_size_px = half_size_px(region.pixel_box);
         // A hand that puts a cup down is one region with it: what counts is where and what it is when the hand is gone.
         if followed.last_frame != self.frames
             && placed.is_some_and(|placed| followed.has_left_for(&placed))
@@ -391,6 +413,7 @@ impl Events {
                 extent_in_world: Vector3::zeros(),
                 peak_surprise: 0.0,
                 unseen_share: 0.0,
+                unseen_points: Vec::new(),
                 sightings: 0,
                 robots: Vec::new(),
                 peak: sighting.clone(),
@@ -518,6 +541,8 @@ impl Followed {
     fn tell(&mut self, stamp_ns: i64, state: State, changed: &mut Vec<Event>) {
         self.patches = Vec::new();
         self.event.state = state;
+        let unknown = self.points.iter().filter(|(_, known)| !known);
+        self.event.unseen_points = unknown.map(|(point, _)| *point).collect();
         self.told = Some(Told {
             stamp_ns,
             peak: self.event.peak_surprise,
@@ -570,6 +595,18 @@ impl Followed {
             (true, false) => Verdict::Surprising,
         }
     }
+}
+
+/// Half of a box's longer side.
+fn half_size_px(pixel_box: PixelBox) -> f64 {
+    let side = |min: u32, max: u32| f64::from(max.saturating_sub(min));
+    let PixelBox {
+        x_min,
+        y_min,
+        x_max,
+        y_max,
+    } = pixel_box;
+    side(x_min, x_max).max(side(y_min, y_max)) / 2.0
 }
 
 /// The pixel where a point in the world is seen, and its depth, metres; `None` outside of the image without its border

@@ -1,6 +1,8 @@
 //! Messages -> model, checked: what leaves this room has sane poses, cameras and times. Pictures are only measured here;
 //! [`image`] unpacks them when a frame's turn has come.
 
+pub mod event;
+
 pub mod image;
 
 pub mod questions;

@@ -246,7 +246,7 @@ pub fn forget(request: &proto::ForgetRequest) -> Result<Forget, Refusal> {
 }
 
 /// Metres, world.
-fn point(vector: Option<&proto::Vector3>) -> Result<Point3<f64>, Refusal> {
+pub(super) fn point(vector: Option<&proto::Vector3>) -> Result<Point3<f64>, Refusal> {
     let point = vector.map(|v| Point3::new(v.x, v.y, v.z));
     point
         .filter(|point| point.iter().all(|value| value.is_finite()))
