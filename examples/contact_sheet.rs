@@ -97,7 +97,7 @@ fn main() -> anyhow::Result<()> {
             let image = &capture.middle.image;
             let mut image = RgbImage::from_raw(width, height, image.data.clone())
                 .context("three bytes a pixel")?;
-            let place = changed
+            let mut place = changed
                 .iter()
                 .filter_map(|&(item, _)| extent(&capture.middle.masks[item], width));
             // The first and the last, without outlines.
@@ -107,7 +107,7 @@ fn main() -> anyhow::Result<()> {
                 _ => None,
             };
             let close = close_up + 2 * GAP;
-            if let Some(((half, name), middle)) = half.zip(place.last()) {
+            if let Some(((half, name), middle)) = half.zip(place.next_back()) {
                 let cut = cut(&image, middle);
                 let down = top + LINE + half * (height / 2 + GAP);
                 imageops::replace(&mut sheet, &cut, i64::from(close), i64::from(down));
