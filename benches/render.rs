@@ -1,7 +1,7 @@
 //! How long one thread takes to render what the three cameras see, 320x240 each: `cargo bench --bench render`.
 //!
-//! On a quiet Xeon with AVX-512, medians: 104 ms with the table laid, 117 ms with a person reaching in, 37 ms for the middle
-//! camera alone.
+//! On a Xeon with AVX-512 and little else to do: 82 ms with the table laid, 92 ms with a person reaching in, 31 ms for the
+//! middle camera alone.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use surprised::simulation::script::{Script, Views};

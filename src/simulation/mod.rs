@@ -15,6 +15,8 @@ pub mod shapes;
 
 pub mod texture;
 
+mod casters;
+
 pub mod scene;
 
 pub mod tracer;

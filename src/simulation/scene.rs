@@ -1,6 +1,7 @@
 //! What there is to see: shapes with materials, sorted into a tree of bounding boxes.
 
 use super::{
+    casters::Casters,
     shapes::{Bounds, Crossing, Ray, Shape},
     texture::Pattern,
 };
@@ -90,8 +91,8 @@ pub struct Scene {
     primitives: Vec<Primitive>,
     /// Of each primitive.
     bounds: Vec<Bounds>,
-    /// Of each primitive: whether it may hide the lamp, and the sky.
-    hides: Vec<[bool; 2]>,
+    /// Of the lamp, and of the sky.
+    casters: [Casters; 2],
     nodes: Vec<Node>,
 }
 
@@ -103,31 +104,45 @@ struct Node {
     count: u32,
     /// Branch: the left child lies lower along it.
     axis: u8,
-    hides_lamp: bool,
-    hides_sky: bool,
 }
 
-type Boxed = (Bounds, Primitive);
+/// What the tree needs to know of a primitive, and which it is.
+struct Boxed {
+    bounds: Bounds,
+    index: usize,
+}
 
 const LEAF: usize = 2;
 
 impl Scene {
     pub fn new(primitives: Vec<Primitive>) -> Self {
         let mut boxed: Vec<Boxed> = primitives
-            .into_iter()
-            .map(|primitive| (primitive.shape.bounds(), primitive))
+            .iter()
+            .zip(0..)
+            .map(|(primitive, index)| Boxed {
+                bounds: primitive.shape.bounds(),
+                index,
+            })
             .collect();
         let mut nodes = Vec::with_capacity(boxed.len() * 2);
         if !boxed.is_empty() {
             build(&mut boxed, 0, &mut nodes);
         }
-        let (bounds, primitives): (_, Vec<_>) = boxed.into_iter().unzip();
+        let mut unsorted: Vec<_> = primitives.into_iter().map(Some).collect();
+        let primitives: Vec<_> = boxed
+            .iter()
+            .filter_map(|boxed| unsorted[boxed.index].take())
+            .collect();
         Self {
-            bounds,
-            hides: primitives
-                .iter()
-                .map(|primitive| [Light::Lamp, Light::Sky].map(|light| primitive.hides(light)))
-                .collect(),
+            casters: [Light::Lamp, Light::Sky].map(|light| {
+                let casters = primitives.iter().zip(0..);
+                Casters::new(
+                    casters
+                        .filter(|(primitive, _)| primitive.hides(light))
+                        .map(|(primitive, index)| (index, primitive.shape.ball())),
+                )
+            }),
+            bounds: boxed.iter().map(|boxed| boxed.bounds).collect(),
             primitives,
             nodes,
         }
@@ -177,25 +192,9 @@ impl Scene {
         best
     }
 
-    /// Collects the primitives that may hide this light and whose bounds `may_hide` does not exclude.
-    pub fn casters(&self, light: Light, found: &mut Vec<u32>, may_hide: impl Fn(&Bounds) -> bool) {
-        found.clear();
-        self.walk(
-            |node, ()| {
-                let any = match light {
-                    Light::Lamp => node.hides_lamp,
-                    Light::Sky => node.hides_sky,
-                };
-                any && may_hide(&node.bounds)
-            },
-            |_| true,
-            &mut (),
-            |index, _| {
-                if self.hides[index][light as usize] && may_hide(&self.bounds[index]) {
-                    found.push(index as u32);
-                }
-            },
-        );
+    /// What may hide this light.
+    pub fn casters(&self, light: Light) -> &Casters {
+        &self.casters[light as usize]
     }
 
     fn walk<S: Copy>(
@@ -237,19 +236,13 @@ impl Scene {
 fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
     let bounds = primitives
         .iter()
-        .fold(Bounds::EMPTY, |bounds, (own, _)| bounds.joined(own));
+        .fold(Bounds::EMPTY, |bounds, boxed| bounds.joined(&boxed.bounds));
     let index = nodes.len();
     nodes.push(Node {
         bounds,
         start: offset,
         count: primitives.len() as u32,
         axis: 0,
-        hides_lamp: primitives
-            .iter()
-            .any(|(_, primitive)| primitive.hides(Light::Lamp)),
-        hides_sky: primitives
-            .iter()
-            .any(|(_, primitive)| primitive.hides(Light::Sky)),
     });
     if primitives.len() <= LEAF {
         return;
@@ -266,7 +259,7 @@ fn build(primitives: &mut [Boxed], offset: u32, nodes: &mut Vec<Node>) {
 
 fn sort_along(primitives: &mut [Boxed], axis: usize) {
     // Twice the centre.
-    let place = |(bounds, _): &Boxed| bounds.min[axis] + bounds.max[axis];
+    let place = |boxed: &Boxed| boxed.bounds.min[axis] + boxed.bounds.max[axis];
     primitives.sort_by(|a, b| place(a).total_cmp(&place(b)));
 }
 
@@ -281,12 +274,12 @@ fn best_split(primitives: &mut [Boxed]) -> (usize, usize) {
         let mut above = vec![0.0; count];
         let mut bounds = Bounds::EMPTY;
         for index in (1..count).rev() {
-            bounds = bounds.joined(&primitives[index].0);
+            bounds = bounds.joined(&primitives[index].bounds);
             above[index] = bounds.surface() * (count - index) as f64;
         }
         let mut bounds = Bounds::EMPTY;
         for middle in 1..=count - least {
-            bounds = bounds.joined(&primitives[middle - 1].0);
+            bounds = bounds.joined(&primitives[middle - 1].bounds);
             let cost = bounds.surface() * middle as f64 + above[middle];
             if middle >= least && cost < best.0 {
                 best = (cost, axis, middle);

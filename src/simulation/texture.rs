@@ -1,7 +1,7 @@
 //! Procedural textures: the colour of a surface at a point, averaged over what one pixel covers of it.
 //!
-//! Colours are linear RGB. Detail finer than the `footprint` (metres on the surface) fades into its mean, so that
-//! textures neither flicker nor alias.
+//! Colours are linear RGB. Detail finer than the `footprint` (metres on the surface, along u and along v: an oblique view
+//! covers more of the one than of the other) fades into its mean, so that textures neither flicker nor alias.
 //!
 //! Single precision; noise is evaluated for several points side by side.
 
@@ -37,30 +37,38 @@ pub struct Spot {
     /// Metres, right and up on the surface.
     pub u: f32,
     pub v: f32,
-    /// Diameter of what a pixel covers, metres.
-    pub footprint: f32,
+    /// Width of what a pixel covers, along u and along v, metres.
+    pub footprint: [f32; 2],
 }
 
-/// Several places on surfaces of one pattern.
-struct Spots<const N: usize> {
+/// Several [`Spot`]s on surfaces of one pattern.
+pub struct Spots<const N: usize> {
     u: [f32; N],
     v: [f32; N],
-    footprint: [f32; N],
-    /// The least footprint.
-    finest: f32,
+    footprint: [[f32; N]; 2],
+    /// The least footprints.
+    finest: [f32; 2],
 }
 
 impl<const N: usize> Spots<N> {
     #[inline(always)]
-    fn new(spots: &[Spot; N]) -> Self {
+    pub fn new(u: [f32; N], v: [f32; N], footprint: [[f32; N]; 2]) -> Self {
         Self {
-            u: spots.map(|spot| spot.u),
-            v: spots.map(|spot| spot.v),
-            footprint: spots.map(|spot| spot.footprint),
-            finest: spots
-                .iter()
-                .fold(f32::INFINITY, |finest, spot| finest.min(spot.footprint)),
+            u,
+            v,
+            finest: [0, 1]
+                .map(|axis: usize| footprint[axis].into_iter().fold(f32::INFINITY, f32::min)),
+            footprint,
         }
+    }
+
+    #[inline(always)]
+    fn of(spots: &[Spot; N]) -> Self {
+        Self::new(
+            spots.map(|spot| spot.u),
+            spots.map(|spot| spot.v),
+            [0, 1].map(|axis| spots.map(|spot| spot.footprint[axis])),
+        )
     }
 }
 
@@ -169,22 +177,22 @@ fn floor(x: f32) -> i32 {
     whole - i32::from(x < whole as f32)
 }
 
+/// How much of a detail of this size survives the mean over a pixel of that footprint, 0..1.
 #[inline(always)]
-fn modulo(x: f32, period: f32) -> f32 {
-    x - floor(x / period) as f32 * period
+fn kept(per_size: f32, footprint: f32) -> f32 {
+    let ratio = footprint * per_size;
+    let left = (1.0 - KEPT * ratio * ratio).max(0.0);
+    left * left
 }
+const KEPT: f32 = 0.25;
 
-/// How much of a detail of this size survives a pixel of that footprint, 0..1.
-#[inline(always)]
-fn kept(size: f32, footprint: f32) -> f32 {
-    (size / footprint - 1.0).clamp(0.0, 1.0)
-}
-
-/// Sum of noises from `size` downwards, each half as large and as strong; -1..1 about.
+/// Sum of noises from `size` downwards, each half as large and as strong; -1..1 about. `squeeze`: how many times as long
+/// the detail is along u and v.
 #[inline(always)]
 fn clouds<const N: usize>(
     u: &[f32; N],
     v: &[f32; N],
+    squeeze: [f32; 2],
     size: f32,
     octaves: u32,
     spots: &Spots<N>,
@@ -193,14 +201,21 @@ fn clouds<const N: usize>(
     let mut sum = [0.0; N];
     let (mut size, mut strength) = (size, 0.6);
     for octave in 0..octaves {
-        if kept(size, spots.finest) == 0.0 {
+        let per_metre = squeeze.map(|squeeze| squeeze / size);
+        let left = |footprint: [f32; 2]| {
+            kept(per_metre[0], footprint[0]) * kept(per_metre[1], footprint[1])
+        };
+        if left(spots.finest) == 0.0 {
             break;
         }
-        let per_metre = size.recip();
         for lane in 0..N {
             sum[lane] += strength
-                * kept(size, spots.footprint[lane])
-                * noise(u[lane] * per_metre, v[lane] * per_metre, seed + octave);
+                * left([spots.footprint[0][lane], spots.footprint[1][lane]])
+                * noise(
+                    u[lane] * per_metre[0],
+                    v[lane] * per_metre[1],
+                    seed + octave,
+                );
         }
         size *= 0.5;
         strength *= 0.55;
@@ -216,12 +231,23 @@ fn above(x: f32, edge: f32, footprint: f32) -> f32 {
 
 #[inline(always)]
 fn between(x: f32, low: f32, high: f32, footprint: f32) -> f32 {
-    above(x, low, footprint) * (1.0 - above(x, high, footprint))
+    above(x, low, footprint) - above(x, high, footprint)
+}
+
+/// [`between`] of what repeats every `period`.
+#[inline(always)]
+fn between_each(x: f32, period: f32, low: f32, high: f32, footprint: f32) -> f32 {
+    // Of all before a place.
+    let covered = |x: f32| {
+        let turn = floor(x / period) as f32;
+        turn * (high - low) + (x - turn * period - low).clamp(0.0, high - low)
+    };
+    (covered(x + 0.5 * footprint) - covered(x - 0.5 * footprint)) / footprint
 }
 
 /// Stripes of unequal width in a strip pattern of 0.21 m, of strength 0..1.
 #[inline(always)]
-fn stripes<const N: usize>(x: &[f32; N], spots: &Spots<N>, seed: u32) -> [f32; N] {
+fn stripes<const N: usize>(x: &[f32; N], footprint: &[f32; N], seed: u32) -> [f32; N] {
     const PERIOD: f32 = 0.21;
     const LINES: [(f32, f32, f32); 6] = [
         (0.010, 0.034, 0.85),
@@ -231,17 +257,19 @@ fn stripes<const N: usize>(x: &[f32; N], spots: &Spots<N>, seed: u32) -> [f32; N
         (0.156, 0.161, 0.90),
         (0.186, 0.191, 0.40),
     ];
-    let mut strengths = [0.0f32; N];
+    let turn: [i32; N] = std::array::from_fn(|lane| floor(x[lane] * (1.0 / PERIOD)));
+    let inside = sums::<N>(|lane| x[lane] - turn[lane] as f32 * PERIOD);
+    // Of the footprint, covered.
+    let mut covered = [0.0f32; N];
     for (&(low, high, strength), line) in LINES.iter().zip(0..) {
         for lane in 0..N {
-            let turn = floor(x[lane] * (1.0 / PERIOD));
-            let inside = x[lane] - turn as f32 * PERIOD;
-            let shift = (hash(turn, line, seed) - 0.5) * 0.012;
-            let cover = between(inside, low + shift, high + shift, spots.footprint[lane]);
-            strengths[lane] += strength * cover;
+            let shifted = inside[lane] - (hash(turn[lane], line, seed) - 0.5) * 0.012;
+            let reach = footprint[lane] * 0.5;
+            let common = (shifted + reach).min(high) - (shifted - reach).max(low);
+            covered[lane] += strength * common.max(0.0);
         }
     }
-    strengths.map(|strength| strength.min(1.0))
+    sums(|lane| (covered[lane] / footprint[lane]).min(1.0))
 }
 
 /// The complex number to this power.
@@ -259,7 +287,7 @@ fn of_each<const N: usize>(spots: &Spots<N>, colour: impl Fn(usize, &Spot) -> Rg
             &Spot {
                 u: spots.u[lane],
                 v: spots.v[lane],
-                footprint: spots.footprint[lane],
+                footprint: spots.footprint.map(|footprint| footprint[lane]),
             },
         )
     })
@@ -281,18 +309,19 @@ for_each_isa! {
 
 #[inline(always)]
 fn colours_kernel(pattern: &Pattern, spots: &[Spot; LANES], colours: &mut [Rgb; LANES]) {
-    *colours = pattern.colours(&Spots::new(spots));
+    *colours = pattern.colours(&Spots::of(spots));
 }
 
 impl Pattern {
     /// Linear RGB reflectance.
     pub fn colour(&self, spot: &Spot) -> Rgb {
-        let [colour] = self.colours(&Spots::new(&[*spot]));
+        let [colour] = self.colours(&Spots::of(&[*spot]));
         colour
     }
 
+    /// [`Self::colour`] at several places.
     #[inline(always)]
-    fn colours<const N: usize>(&self, spots: &Spots<N>) -> [Rgb; N] {
+    pub fn colours<const N: usize>(&self, spots: &Spots<N>) -> [Rgb; N] {
         let Spots { u, v, .. } = spots;
         match self {
             Self::Plain(colour) => [*colour; N],
@@ -302,20 +331,38 @@ impl Pattern {
                 weft,
                 seed,
             } => {
-                let fold = clouds(u, v, 0.11, 1, spots, seed + 9);
-                let along = stripes(&sums(|i| u[i] + fold[i] * 0.004), spots, *seed);
-                let across = stripes(&sums(|i| v[i] + fold[i] * 0.0028 + 0.05), spots, seed + 1);
-                let fine = clouds(u, v, 0.02, 2, spots, seed + 2);
-                let broad = clouds(u, v, 0.2, 1, spots, seed + 3);
-                of_each(spots, |lane, &Spot { u, v, footprint }| {
-                    let colour = mixed(
-                        mixed(*ground, *warp, along[lane] * 0.8),
-                        *weft,
-                        across[lane] * 0.62,
-                    );
-                    let colour = embroidered(colour, *warp, u, v, footprint, seed + 4);
-                    scaled(colour, 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane])
-                })
+                let fold = clouds(u, v, EVEN, 0.11, 1, spots, seed + 9);
+                let [wide, high] = &spots.footprint;
+                let along = stripes(&sums(|i| u[i] + fold[i] * 0.004), wide, *seed);
+                let across = stripes(&sums(|i| v[i] + fold[i] * 0.0028 + 0.05), high, seed + 1);
+                let fine = clouds(u, v, EVEN, 0.02, 2, spots, seed + 2);
+                let broad = clouds(u, v, EVEN, 0.2, 1, spots, seed + 3);
+                let dotted: [bool; N] = std::array::from_fn(|lane| {
+                    let (_, du, dv) = dot_by(u[lane], v[lane], seed + 4);
+                    let reach = DOT + wide[lane].max(high[lane]);
+                    du * du + dv * dv < reach * reach
+                });
+                let mut colours = [[0.0; 3]; N];
+                for channel in 0..3 {
+                    let [ground, warp, weft] = [ground, warp, weft].map(|yarn| yarn[channel]);
+                    for lane in 0..N {
+                        let woven = ground + (warp - ground) * along[lane] * 0.8;
+                        let woven = woven + (weft - woven) * across[lane] * 0.62;
+                        let light = 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane];
+                        colours[lane][channel] = woven * light;
+                    }
+                }
+                for lane in 0..N {
+                    if dotted[lane] {
+                        let light = 1.0 + 0.10 * fine[lane] + 0.05 * broad[lane];
+                        let cloth = scaled(colours[lane], light.recip());
+                        let footprint = [wide[lane], high[lane]];
+                        let (u, v) = (u[lane], v[lane]);
+                        let dot = embroidered(cloth, *warp, u, v, footprint, seed + 4);
+                        colours[lane] = scaled(dot, light);
+                    }
+                }
+                colours
             }
             Self::Planks {
                 light,
@@ -328,17 +375,18 @@ impl Pattern {
                 let length: [i32; N] = std::array::from_fn(|i| floor((u[i] + shift[i]) / 1.3));
                 let tint = sums::<N>(|i| hash(plank[i], length[i], seed + 1));
                 let own = sums(|i| u[i] + tint[i] * 17.0);
-                let wave = clouds(&own, v, 0.25, 1, spots, seed + 6);
+                let wave = clouds(&own, v, EVEN, 0.25, 1, spots, seed + 6);
                 let waved = sums(|i| v[i] + wave[i] * 0.02);
-                let fine = clouds(&own.map(|u| u * 0.12), &waved, 0.016, 3, spots, seed + 2);
-                let broad = clouds(&own.map(|u| u * 0.3), v, 0.07, 2, spots, seed + 3);
+                let fine = clouds(&own, &waved, [0.12, 1.0], 0.016, 3, spots, seed + 2);
+                let broad = clouds(&own, v, [0.3, 1.0], 0.07, 2, spots, seed + 3);
                 of_each(spots, |lane, &Spot { u, v, footprint }| {
                     let grain = fine[lane] + 0.5 * broad[lane];
                     let share = (0.25 + 0.4 * tint[lane] + 0.45 * grain).clamp(0.0, 1.0);
                     let across = v - plank[lane] as f32 * width;
                     let along = u + shift[lane] - length[lane] as f32 * 1.3;
-                    let joint = |x: f32| between(x, 0.0, 0.0025, footprint);
-                    let joints = (joint(across) + joint(along)).min(1.0);
+                    let joint = |x: f32, footprint| between(x, 0.0, 0.0025, footprint);
+                    let [wide, high] = footprint;
+                    let joints = (joint(across, high) + joint(along, wide)).min(1.0);
                     scaled(mixed(*light, *dark, share), 1.0 - 0.65 * joints)
                 })
             }
@@ -347,15 +395,15 @@ impl Pattern {
                 figure,
                 seed,
             } => {
-                let fine = clouds(u, v, 0.03, 2, spots, seed + 2);
-                let broad = clouds(u, v, 0.5, 2, spots, seed + 3);
+                let fine = clouds(u, v, EVEN, 0.03, 2, spots, seed + 2);
+                let broad = clouds(u, v, EVEN, 0.5, 2, spots, seed + 3);
                 of_each(spots, |lane, spot| {
                     let colour = mixed(*ground, *figure, blossom(spot, *seed));
                     scaled(colour, 1.0 + 0.05 * fine[lane] + 0.09 * broad[lane])
                 })
             }
             Self::Mottled { a, b, size, seed } => {
-                let cloud = clouds(u, v, *size, 3, spots, *seed);
+                let cloud = clouds(u, v, EVEN, *size, 3, spots, *seed);
                 cloud.map(|cloud| mixed(*a, *b, (0.5 + 0.7 * cloud).clamp(0.0, 1.0)))
             }
             Self::Rings {
@@ -364,18 +412,17 @@ impl Pattern {
                 period,
                 share_of_b,
             } => of_each(spots, |_, &Spot { v, footprint, .. }| {
-                let x = modulo(v, *period);
                 let width = share_of_b * period;
                 let (low, high) = ((period - width) * 0.5, (period + width) * 0.5);
-                mixed(*a, *b, between(x, low, high, footprint))
+                mixed(*a, *b, between_each(v, *period, low, high, footprint[1]))
             }),
             Self::Knit { a, b, period } => {
                 let sway = sums::<N>(|i| noise(u[i] / period, v[i] / period, 5));
-                let fine = clouds(u, v, 0.012, 2, spots, 31);
-                let broad = clouds(u, v, 0.09, 2, spots, 32);
+                let fine = clouds(u, v, EVEN, 0.012, 2, spots, 31);
+                let broad = clouds(u, v, EVEN, 0.09, 2, spots, 32);
                 of_each(spots, |lane, &Spot { v, footprint, .. }| {
-                    let x = modulo(v + 0.3 * period * sway[lane], *period);
-                    let line = between(x, 0.0, period * 0.4, footprint);
+                    let x = v + 0.3 * period * sway[lane];
+                    let line = between_each(x, *period, 0.0, period * 0.4, footprint[1]);
                     let grain = 1.0 + 0.16 * fine[lane] + 0.2 * broad[lane];
                     scaled(mixed(*a, *b, line), grain)
                 })
@@ -385,21 +432,20 @@ impl Pattern {
                 height,
                 seed,
             } => {
-                let brush = clouds(u, &v.map(|v| v * 2.5), 0.03, 2, spots, seed + 7);
+                let brush = clouds(u, v, [1.0, 2.5], 0.03, 2, spots, seed + 7);
                 of_each(spots, |lane, spot| {
                     picture(spot, *width, *height, *seed, brush[lane])
                 })
             }
             Self::Spine { ground, ink, seed } => {
-                let fine = clouds(u, v, 0.03, 2, spots, *seed);
+                let fine = clouds(u, v, EVEN, 0.03, 2, spots, *seed);
                 of_each(spots, |lane, &Spot { u, v, footprint }| {
+                    let [wide, high] = footprint;
                     let letter = hash(floor(v / 0.006), floor(u / 0.004), seed + 1) > 0.45;
-                    let title = f32::from(letter)
-                        * between(v, 0.05, 0.13, footprint)
-                        * between(u, -0.007, 0.007, footprint)
-                        * kept(0.008, footprint);
-                    let bands =
-                        between(v, 0.018, 0.026, footprint) + between(v, 0.150, 0.156, footprint);
+                    let title = print_of(letter, 0.55, footprint)
+                        * between(v, 0.05, 0.13, high)
+                        * between(u, -0.007, 0.007, wide);
+                    let bands = between(v, 0.018, 0.026, high) + between(v, 0.150, 0.156, high);
                     let inked = (title + bands).min(1.0) * 0.85;
                     scaled(mixed(*ground, *ink, inked), 1.0 + 0.12 * fine[lane])
                 })
@@ -409,29 +455,58 @@ impl Pattern {
     }
 }
 
-/// Embroidered dots in some of the tartan's fields.
-fn embroidered(colour: Rgb, warp: Rgb, u: f32, v: f32, footprint: f32, seed: u32) -> Rgb {
-    let (i, j) = (floor(u / 0.07), floor(v / 0.07));
-    let chosen = hash(i, j, seed);
-    if chosen <= 0.55 {
-        return colour;
-    }
-    let du = u - (i as f32 + 0.3 + chosen * 0.4) * 0.07;
+/// Details as long as wide.
+const EVEN: [f32; 2] = [1.0; 2];
+
+/// Small print, cells of 4 by 6 mm of which a `share` is inked.
+#[inline(always)]
+fn print_of(inked: bool, share: f32, [wide, high]: [f32; 2]) -> f32 {
+    let kept = kept(1.0 / 0.005, wide) * kept(1.0 / 0.005, high);
+    share + (f32::from(inked) - share) * kept
+}
+
+/// What a pixel covers in the direction `(u, v)` of length `length`.
+#[inline(always)]
+fn towards([wide, high]: [f32; 2], u: f32, v: f32, length: f32) -> f32 {
+    let (u, v) = (wide * u, high * v);
+    (u * u + v * v).sqrt() / length
+}
+
+/// Reach of the longest petals of an embroidered dot, metres.
+const DOT: f32 = 0.013;
+
+/// The embroidered dot in this one of the tartan's fields: which kind, 0..1, and the way to here from its heart; far away
+/// in a field that has none.
+#[inline(always)]
+fn dot_by(u: f32, v: f32, seed: u32) -> (f32, f32, f32) {
+    let (i, j) = (floor(u * (1.0 / 0.07)), floor(v * (1.0 / 0.07)));
+    let kind = hash(i, j, seed);
+    let du = u - (i as f32 + 0.3 + kind * 0.4) * 0.07;
     let dv = v - (j as f32 + 0.5) * 0.07;
-    let radius = (du * du + dv * dv).sqrt();
-    // Beyond its longest petals there is nothing of it.
-    if radius >= 0.013 + footprint {
-        return colour;
-    }
-    // The cosine of five times the angle.
-    let away = radius.max(1e-6);
-    let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
-    let figure = 1.0 - above(radius, petal, footprint);
-    let heart = 1.0 - above(radius, 0.004, footprint);
+    (kind, du, if kind > 0.55 { dv } else { 1.0 })
+}
+
+/// The cloth's colour with what an embroidered dot near by covers of the pixel.
+fn embroidered(cloth: Rgb, warp: Rgb, u: f32, v: f32, footprint: [f32; 2], seed: u32) -> Rgb {
     static YARNS: LazyLock<[Rgb; 2]> = LazyLock::new(|| [rgb(0xc98a2b), rgb(0xf4e3b0)]);
     let [gold, cream] = *YARNS;
-    let thread = mixed(warp, gold, f32::from(chosen > 0.78));
-    mixed(mixed(colour, thread, figure * 0.9), cream, heart)
+    let (kind, du, dv) = dot_by(u, v, seed);
+    let thread = mixed(warp, gold, f32::from(kind > 0.78));
+    // A dot is hardly larger than a pixel's print: by quarters.
+    let quarter = footprint.map(|side| side * 0.5);
+    let mut sum = [0.0; 3];
+    for (right, up) in [(-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25)] {
+        let (du, dv) = (du + right * footprint[0], dv + up * footprint[1]);
+        let away = (du * du + dv * dv).sqrt().max(1e-6);
+        let across = towards(quarter, du, dv, away);
+        // The cosine of five times the angle.
+        let petal = 0.009 + 0.004 * power((du / away, dv / away), 5).0;
+        let figure = 1.0 - above(away, petal, across);
+        let heart = 1.0 - above(away, 0.004, across);
+        let colour = mixed(mixed(cloth, thread, figure * 0.9), cream, heart);
+        sum = std::array::from_fn(|i| sum[i] + 0.25 * colour[i]);
+    }
+    sum
 }
 
 /// How much of the wallpaper's figure, a flower on a stalk, is at a place.
@@ -443,7 +518,7 @@ fn blossom(&Spot { u, v, footprint }: &Spot, seed: u32) -> f32 {
     let dv = v - (row as f32 + 0.5) * 0.2 - odd * 0.1;
     let radius = (du * du + 0.64 * dv * dv).sqrt();
     // Its longest petals reach 57 mm.
-    let shape = if radius < 0.057 + footprint {
+    let shape = if radius < 0.057 + footprint[0].max(footprint[1]) {
         let away = (du * du + dv * dv).sqrt().max(1e-6);
         let towards = (du / away, dv / away);
         let (tilt_sin, tilt_cos) = (hash(column, row, seed) * 6.0).sin_cos();
@@ -451,12 +526,12 @@ fn blossom(&Spot { u, v, footprint }: &Spot, seed: u32) -> f32 {
         let (cos5, sin5) = power(towards, 5);
         let petals = cos5 * tilt_cos - sin5 * tilt_sin;
         let edge = 0.035 + 0.016 * petals + 0.006 * power(towards, 9).1;
-        between(radius, 0.012, edge, footprint)
+        between(radius, 0.012, edge, self::towards(footprint, du, dv, away)).max(0.0)
     } else {
         0.0
     };
-    let stalk = if du.abs() < 0.015 + footprint {
-        between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint)
+    let stalk = if du.abs() < 0.015 + footprint[0] {
+        between(du + 0.012 * (dv * 40.0).sin(), -0.003, 0.003, footprint[0])
     } else {
         0.0
     };
@@ -486,6 +561,7 @@ fn picture(
     });
     let [dark_wood, light_wood, low_sky, high_sky, sun_paint] = *PAINTS;
     let (x, y) = (u / width, v / height);
+    let [wide, high] = footprint;
     let border = 0.025;
     if u.abs() > width * 0.5 - border || v < border || v > height - border {
         return mixed(
@@ -499,7 +575,7 @@ fn picture(
         - above(
             (x - 0.18).hypot((y - 0.72) * height / width),
             0.07,
-            footprint / width,
+            wide / width,
         );
     let mut colour = mixed(sky, sun_paint, sun);
     for (layer, &(level, paint)) in HILLS.iter().enumerate() {
@@ -507,7 +583,7 @@ fn picture(
         let hill = level
             + 0.10 * noise(x * 3.1, layer * 7.3, seed)
             + 0.03 * noise(x * 11.0, layer * 3.7, seed + 1);
-        colour = mixed(paint, colour, above(y, hill, footprint / height));
+        colour = mixed(paint, colour, above(y, hill, high / height));
     }
     scaled(colour, 1.0 + 0.25 * brush)
 }
@@ -517,25 +593,28 @@ impl Label {
         let cell = floor(u / self.repeat + 0.5);
         let x = u - cell as f32 * self.repeat;
         let wave = 0.004 * (x / self.repeat * std::f32::consts::TAU * 2.0).sin();
-        let band = between(v, self.band_v.0 + wave, self.band_v.1 + wave, footprint);
+        let [wide, high] = footprint;
+        let band = between(v, self.band_v.0 + wave, self.band_v.1 + wave, high);
         let rim = between(
             v,
             self.band_v.1 + wave + 0.003,
             self.band_v.1 + wave + 0.006,
-            footprint,
+            high,
         );
         let mut colour = mixed(self.ground, self.band, (band + rim).min(1.0));
         // Small print and a round emblem below the name.
         let emblem_v = self.text_v - self.letter * 1.5;
         let emblem = x.hypot(v - emblem_v);
-        let ring = between(emblem, self.letter * 0.45, self.letter * 0.6, footprint) + 1.0
-            - above(emblem, self.letter * 0.25, footprint);
+        let covered = towards(footprint, x, v - emblem_v, emblem.max(1e-6));
+        let ring = between(emblem, self.letter * 0.45, self.letter * 0.6, covered) + 1.0
+            - above(emblem, self.letter * 0.25, covered);
         colour = mixed(colour, self.ink, ring.min(1.0) * 0.9);
         let line = floor((v - 0.01) / 0.006);
-        let print = f32::from(hash(floor(u / 0.004), line, self.seed) > 0.4)
+        let inked = hash(floor(u / 0.004), line, self.seed) > 0.4;
+        let print = print_of(inked, 0.6, footprint)
             * f32::from((0..4).contains(&line))
-            * between(modulo(v - 0.01, 0.006), 0.0015, 0.0045, footprint)
-            * between(x, -self.repeat * 0.3, self.repeat * 0.3, footprint);
+            * between_each(v - 0.01, 0.006, 0.0015, 0.0045, high)
+            * between(x, -self.repeat * 0.3, self.repeat * 0.3, wide);
         colour = mixed(colour, self.ink, print * 0.7);
         let ink = text_cover(self.text, x, v - self.text_v, self.letter, footprint);
         mixed(colour, self.ink, ink)
@@ -543,10 +622,10 @@ impl Label {
 }
 
 /// Share of the pixel that letters cover; `(x, y)` metres from the text's middle.
-fn text_cover(text: &str, x: f32, y: f32, letter: f32, footprint: f32) -> f32 {
+fn text_cover(text: &str, x: f32, y: f32, letter: f32, [wide, high]: [f32; 2]) -> f32 {
     let dot = letter / 7.0;
     let width = text.len() as f32 * 6.0 * dot;
-    if x.abs() > width * 0.5 + footprint || y.abs() > letter * 0.5 + footprint {
+    if x.abs() > width * 0.5 + wide || y.abs() > letter * 0.5 + high {
         return 0.0;
     }
     let set = |x: f32, y: f32| {
@@ -565,7 +644,7 @@ fn text_cover(text: &str, x: f32, y: f32, letter: f32, footprint: f32) -> f32 {
     let hits = (0..16)
         .filter(|i| {
             let offset = |k: i32| (k as f32 + 0.5) / 4.0 - 0.5;
-            set(x + offset(i % 4) * footprint, y + offset(i / 4) * footprint)
+            set(x + offset(i % 4) * wide, y + offset(i / 4) * high)
         })
         .count();
     hits as f32 / 16.0

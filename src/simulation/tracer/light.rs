@@ -3,25 +3,25 @@
 //! In: a point on a surface. Out: two shares, 0..1. Both are sampled; a tile looks for them at as few of its points as
 //! their differences allow.
 
+use std::sync::LazyLock;
+
 use nalgebra::{Matrix3, Point3, Vector3};
 
 use super::{
-    LIFT, Path, Scratch, Seen, Tracer,
+    Path, Scratch, Seen, Tracer,
     tiles::{TILE, Tile},
 };
 use crate::{
+    isa::{Isa, for_each_isa},
+    lanes::{LANES, Lanes},
     model::{camera::Intrinsics, pose::Pose},
     simulation::{
-        scene::{Hit, Light},
-        shapes::{Bounds, Ray},
+        casters::Beam,
+        scene::{Hit, Light, Scene},
+        shapes::{Ball, Bounds, Directions, PLAIN},
     },
 };
 
-const LAMP_SAMPLES: usize = 9;
-const SKY_SAMPLES: usize = 5;
-/// Where a sample is one of several of a pixel.
-const FEW_LAMP_SAMPLES: usize = 4;
-const FEW_SKY_SAMPLES: usize = 3;
 /// Things farther than this do not dim the sky light, metres.
 const SKY_REACH: f64 = 0.26;
 /// Share of light that one pane of glass lets through to what is in its shadow.
@@ -55,12 +55,12 @@ pub struct LitView {
     depth_m: Vec<f32>,
     camera: Intrinsics,
     eye: Point3<f64>,
-    /// Of the world: turns and scales it to `(u, v, 1)` times depth.
-    pixels_from_world: Matrix3<f64>,
+    /// Of the world: turns and scales it to `(u, v, 1)` times depth; rows.
+    pixels_from_world: [Vector3<f64>; 3],
 }
 
 /// Depths that differ by more, relative to themselves, are not of one place on a face.
-const SAME_DEPTH: f64 = 0.03;
+const SAME_DEPTH: f32 = 0.03;
 /// Of the four pixels around a point, those that show its face must have so much of the weight.
 const ENOUGH: f32 = 0.2;
 
@@ -76,25 +76,31 @@ impl LitView {
             0.0, camera.fy, camera.cy, //
             0.0, 0.0, 1.0,
         );
+        let pixels_from_world =
+            pixels_from_camera * world_from_camera.rotation.inverse().to_rotation_matrix();
         Self {
             lit,
             depth_m,
             camera,
             eye: Point3::from(world_from_camera.translation.vector),
-            pixels_from_world: pixels_from_camera
-                * world_from_camera.rotation.inverse().to_rotation_matrix(),
+            pixels_from_world: [0, 1, 2].map(|row| pixels_from_world.row(row).transpose()),
         }
     }
 
     /// The light on a point, if the camera sees the place: from the pixels around it that show the same face.
+    // Asked for most pixels of the side cameras.
+    #[inline(always)]
     pub(super) fn light_at(&self, hit: &Hit, point: &Point3<f64>) -> Option<Lit> {
-        let scaled = self.pixels_from_world * (point - self.eye);
-        let depth_m = scaled.z;
+        let from_eye = point - self.eye;
+        let [u, v, depth_m] = self
+            .pixels_from_world
+            .each_ref()
+            .map(|row| row.x * from_eye.x + row.y * from_eye.y + row.z * from_eye.z);
         if depth_m <= 0.0 {
             return None;
         }
         let nearness = depth_m.recip();
-        let (u, v) = (scaled.x * nearness, scaled.y * nearness);
+        let (u, v) = (u * nearness, v * nearness);
         let Intrinsics { width, height, .. } = self.camera;
         // Also false for what is not a number.
         let inside = u >= 0.0 && v >= 0.0 && u < width as f64 && v < height as f64;
@@ -105,31 +111,31 @@ impl LitView {
         let (column, row) = (u as i32 as usize, v as i32 as usize);
         let (right, down) = ((u - column as f64) as f32, (v - row as f64) as f32);
         let face = face_of(hit);
+        let depth_m = depth_m as f32;
         let (mut weight, mut sky, mut lamp) = (0.0, 0.0, 0.0);
+        let last = (column + 2).min(width);
         for (row, along) in [(row, 1.0 - down), (row + 1, down)] {
             // Rectified cameras meet in whole rows.
             if along < 1e-4 || row >= height {
                 continue;
             }
-            for (column, across) in [(column, 1.0 - right), (column + 1, right)] {
-                if column >= width {
-                    continue;
-                }
-                let near = across * along;
-                let at = row * width + column;
-                let lit = &self.lit[at];
-                let apart = (f64::from(self.depth_m[at]) - depth_m).abs();
-                if lit.face == face && apart < SAME_DEPTH * depth_m {
-                    weight += near;
-                    sky += near * lit.sky;
-                    lamp += near * lit.lamp;
-                }
+            let places = row * width + column..row * width + last;
+            let lits = self.lit[places.clone()].iter().zip(&self.depth_m[places]);
+            for ((lit, there_m), across) in lits.zip([1.0 - right, right]) {
+                let same = lit.face == face && (there_m - depth_m).abs() < SAME_DEPTH * depth_m;
+                let near = if same { across * along } else { 0.0 };
+                weight += near;
+                sky += near * lit.sky;
+                lamp += near * lit.lamp;
             }
         }
-        (weight > ENOUGH).then(|| Lit {
-            face,
-            sky: sky / weight,
-            lamp: lamp / weight,
+        (weight > ENOUGH).then(|| {
+            let share = weight.recip();
+            Lit {
+                face,
+                sky: sky * share,
+                lamp: lamp * share,
+            }
         })
     }
 }
@@ -142,24 +148,100 @@ pub(super) const UNLIT: Lit = Lit {
 };
 
 /// Lamp shares that differ by more are the edge of a shadow, where each pixel is looked at.
-const SHADOW_EDGE: f32 = 0.15;
+const SHADOW_EDGE: f32 = 0.08;
 /// Shares of the lamp and of the sky that differ by less, across a tile, are looked for at few of its points.
-const LEVEL: [f32; 2] = [0.12, 0.16];
+const LEVEL: [f32; 2] = [0.06, 0.08];
 
-/// Points spread evenly over the unit disc: a sunflower's seeds, turned by `twist` of a full turn.
-fn seed_points<const N: usize>(twist: f64) -> [(f64, f64); N] {
+/// Points spread evenly over the unit disc, x and y: a sunflower's seeds. They are the same everywhere, so that shadows
+/// belong to the world, not to whoever looks.
+static SEEDS: LazyLock<[Lanes; 2]> = LazyLock::new(|| {
     const GOLDEN_ANGLE: f64 = 2.399_963_229_728_653;
-    let (step_sin, step_cos) = GOLDEN_ANGLE.sin_cos();
-    let (mut sin, mut cos) = (twist * std::f64::consts::TAU).sin_cos();
-    std::array::from_fn(|index| {
-        let radius = ((index as f64 + 0.5) / N as f64).sqrt();
-        let point = (radius * cos, radius * sin);
-        (sin, cos) = (
-            sin * step_cos + cos * step_sin,
-            cos * step_cos - sin * step_sin,
-        );
-        point
-    })
+    let polar = |index: usize| {
+        let radius = ((index as f64 + 0.5) / LANES as f64).sqrt();
+        (radius, index as f64 * GOLDEN_ANGLE)
+    };
+    let place = |of: fn(f64) -> f64| {
+        std::array::from_fn(|index| {
+            let (radius, angle) = polar(index);
+            (radius * of(angle)) as f32
+        })
+    };
+    [place(f64::cos), place(f64::sin)]
+});
+
+for_each_isa! {
+    /// Share of the lamp that these primitives leave to a point; `rays` lead from there to places on the lamp.
+    fn lamp_left(scene: &Scene, casters: &[u32], point: &Point3<f64>, rays: &Directions, share: &mut f32) = lamp_left_kernel;
+}
+
+#[inline(always)]
+fn lamp_left_kernel(
+    scene: &Scene,
+    casters: &[u32],
+    point: &Point3<f64>,
+    rays: &Directions,
+    share: &mut f32,
+) {
+    let mut left = [1.0; LANES];
+    for &caster in casters {
+        let primitive = &scene.primitives()[caster as usize];
+        let mut nearest = [1.0; LANES];
+        primitive.shape.approach::<PLAIN>(point, rays, &mut nearest);
+        let passed = if primitive.is_glass() {
+            GLASS_SHADOW
+        } else {
+            0.0
+        };
+        for lane in 0..LANES {
+            left[lane] *= if nearest[lane] < 1.0 { passed } else { 1.0 };
+        }
+        if left == [0.0; LANES] {
+            break;
+        }
+    }
+    *share = left.iter().sum::<f32>() / LANES as f32;
+}
+
+for_each_isa! {
+    /// Share of the sky that these primitives leave to a point, as near as [`SKY_REACH`] in the directions of `rays`, of
+    /// unit length.
+    fn sky_left(scene: &Scene, casters: &[u32], point: &Point3<f64>, rays: &Directions, share: &mut f32) = sky_left_kernel;
+}
+
+#[inline(always)]
+fn sky_left_kernel(
+    scene: &Scene,
+    casters: &[u32],
+    point: &Point3<f64>,
+    rays: &Directions,
+    share: &mut f32,
+) {
+    let mut nearest = [SKY_REACH as f32; LANES];
+    for &caster in casters {
+        scene.primitives()[caster as usize]
+            .shape
+            .approach::<PLAIN>(point, rays, &mut nearest);
+    }
+    let hidden = 1.0 - nearest.iter().sum::<f32>() / (SKY_REACH as f32 * LANES as f32);
+    *share = 1.0 - 0.9 * hidden;
+}
+
+/// Rays towards [`SEEDS`] on the disc that `right` and `forward` span, and `middle` farther.
+#[inline(always)]
+fn fan(
+    right: Vector3<f32>,
+    forward: Vector3<f32>,
+    middle: impl Fn(usize) -> Vector3<f32>,
+) -> Directions {
+    let mut rays = [[0.0; LANES]; 3];
+    let [xs, ys] = &*SEEDS;
+    for lane in 0..LANES {
+        let ray = middle(lane) + right * xs[lane] + forward * ys[lane];
+        for axis in 0..3 {
+            rays[axis][lane] = ray[axis];
+        }
+    }
+    rays
 }
 
 fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
@@ -170,6 +252,55 @@ fn basis(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
     };
     let right = helper.cross(normal).normalize();
     (right, normal.cross(&right))
+}
+
+/// The coarsest lattice in a tile: the distance of its points, and the first.
+const COARSE: usize = 4;
+const MIDST: usize = 2;
+
+/// Light that hardly changes over a tile's face.
+struct Level([[Lit; 2]; 2]);
+
+impl Level {
+    /// Of the four points of the coarsest lattice, if they show one face and differ by less than [`LEVEL`].
+    fn between(known: &[[Option<Lit>; TILE]; TILE]) -> Option<Self> {
+        const THERE: usize = MIDST + COARSE;
+        let corners = [
+            [known[MIDST][MIDST]?, known[MIDST][THERE]?],
+            [known[THERE][MIDST]?, known[THERE][THERE]?],
+        ];
+        let all = corners.as_flattened();
+        let range = |of: fn(&Lit) -> f32| {
+            let least = all.iter().map(of).fold(f32::INFINITY, f32::min);
+            all.iter().map(of).fold(0.0, f32::max) - least
+        };
+        (all.iter().all(|lit| lit.face == all[0].face)
+            && range(|lit| lit.lamp) < LEVEL[0]
+            && range(|lit| lit.sky) < LEVEL[1])
+            .then_some(Self(corners))
+    }
+
+    fn face(&self) -> Face {
+        self.0[0][0].face
+    }
+
+    /// Linear in both directions, so that neighbouring tiles join.
+    fn at(&self, column: usize, row: usize) -> Lit {
+        let share = |i: usize| (i as f32 - MIDST as f32) / COARSE as f32;
+        let (across, down) = (share(column), share(row));
+        let [upper, lower] = &self.0;
+        let of = |value: fn(&Lit) -> f32| {
+            let along =
+                |row: &[Lit; 2]| value(&row[0]) + (value(&row[1]) - value(&row[0])) * across;
+            let (upper, lower) = (along(upper), along(lower));
+            (upper + (lower - upper) * down).clamp(0.0, 1.0)
+        };
+        Lit {
+            face: self.face(),
+            sky: of(|lit| lit.sky),
+            lamp: of(|lit| lit.lamp),
+        }
+    }
 }
 
 /// Mean light of the points of the same face at most `reach` pixels away, the nearer ones counting more, if there are
@@ -241,7 +372,7 @@ fn in_beam(
 
 impl Tracer<'_> {
     /// Finds what may shade any of the points that a tile sees.
-    fn look_around(&self, tile: &mut Tile, seen: &[Seen]) {
+    fn look_around(&self, isa: Isa, tile: &mut Tile, seen: &[Seen]) {
         tile.reach = Bounds::of(
             seen.iter()
                 .filter_map(|(_, path, _, hit)| hit.map(|hit| path.ray.at(hit.crossing.t))),
@@ -259,15 +390,32 @@ impl Tracer<'_> {
         let axis = lamp.center - center;
         let length = axis.norm();
         let direction = axis / length;
-        self.scene.casters(Light::Lamp, &mut tile.lamp, |bounds| {
+        let beam = Beam {
+            from: center,
+            from_radius: half.norm(),
+            direction,
+            length,
+            lamp_radius: lamp.radius,
+        };
+        let bounds = |index: u32| &self.scene.bounds()[index as usize];
+        let casters = self.scene.casters(Light::Lamp);
+        casters.in_beam(isa, &beam, &mut tile.lamp);
+        tile.lamp.retain(|&index| {
             let grown = Bounds {
-                min: bounds.min - half,
-                max: bounds.max + half,
+                min: bounds(index).min - half,
+                max: bounds(index).max + half,
             };
             in_beam(&grown, &center, &direction, length, lamp.radius)
         });
-        self.scene.casters(Light::Sky, &mut tile.sky, |bounds| {
-            let apart = (bounds.center() - center).abs() - bounds.half() - half;
+        let about = Ball {
+            center,
+            radius: half.norm() + SKY_REACH,
+        };
+        self.scene
+            .casters(Light::Sky)
+            .near(isa, &about, &mut tile.sky);
+        tile.sky.retain(|&index| {
+            let apart = (bounds(index).center() - center).abs() - bounds(index).half() - half;
             apart.max() < SKY_REACH
         });
     }
@@ -309,7 +457,7 @@ impl Tracer<'_> {
                 return;
             }
         }
-        self.look_around(tile, seen);
+        self.look_around(scratch.isa, tile, seen);
         let tile = &*tile;
         if tile.lamp.is_empty() && tile.sky.is_empty() {
             for (at, path, _, hit) in seen {
@@ -319,9 +467,9 @@ impl Tracer<'_> {
             }
             return;
         }
-        for step in [4, 2, 1] {
+        for step in [COARSE, 2, 1] {
             // The coarsest lattice is centred in the tile.
-            let phase = step / 4 * 2;
+            let phase = step / COARSE * MIDST;
             let on_lattice = |i: usize| i % step == phase;
             let before = known;
             for (column, row, &(at, ref path, _, hit)) in places() {
@@ -333,15 +481,25 @@ impl Tracer<'_> {
                 }
                 let face = face_of(&hit);
                 let shared = match step {
-                    4 => None,
+                    COARSE => None,
                     2 => shared(&before, face, (column, row), TILE, 3, LEVEL),
                     _ => shared(&before, face, (column, row), 1, 1, [SHADOW_EDGE, 1.0])
                         .or_else(|| shared(&before, face, (column, row), 2, 3, LEVEL)),
                 };
-                let light =
-                    shared.unwrap_or_else(|| self.light_on(path, &hit, Some(tile), scratch));
+                let light = shared.unwrap_or_else(|| self.light_on(path, &hit, scratch));
                 known[row][column] = Some(light);
                 lit[at] = light;
+            }
+            let Some(level) = (step == COARSE).then(|| Level::between(&known)).flatten() else {
+                continue;
+            };
+            for (column, row, &(at, _, _, hit)) in places() {
+                let same = hit.is_some_and(|hit| face_of(&hit) == level.face());
+                if same && known[row][column].is_none() {
+                    let light = level.at(column, row);
+                    known[row][column] = Some(light);
+                    lit[at] = light;
+                }
             }
         }
     }
@@ -364,15 +522,9 @@ impl Tracer<'_> {
     }
 
     /// [`Self::light_on`] what is seen in a mirror or through glass. Points of a face that lie close together share it.
-    pub(super) fn light_beyond(
-        &self,
-        path: &Path,
-        hit: &Hit,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> Lit {
+    pub(super) fn light_beyond(&self, path: &Path, hit: &Hit, scratch: &mut Scratch) -> Lit {
         if path.bounces == 0 || path.weight < WEAK {
-            return self.light_on(path, hit, tile, scratch);
+            return self.light_on(path, hit, scratch);
         }
         let point = path.ray.at(hit.crossing.t);
         let cell = (point.coords / CELL_M).map(|x| x.floor() as i32);
@@ -380,18 +532,12 @@ impl Tracer<'_> {
         if let Some(lit) = scratch.beyond.get(&place) {
             return *lit;
         }
-        let lit = self.light_on(path, hit, tile, scratch);
+        let lit = self.light_on(path, hit, scratch);
         scratch.beyond.insert(place, lit);
         lit
     }
 
-    pub(super) fn light_on(
-        &self,
-        path: &Path,
-        hit: &Hit,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> Lit {
+    pub(super) fn light_on(&self, path: &Path, hit: &Hit, scratch: &mut Scratch) -> Lit {
         let primitive = &self.scene.primitives()[hit.primitive];
         if primitive.is_glass() {
             return UNLIT;
@@ -408,139 +554,100 @@ impl Tracer<'_> {
         let facing = path.ray.direction.dot(&outward) < 0.0;
         let normal = if facing { outward } else { -outward };
         let own = (!primitive.hollow).then_some(hit.primitive as u32);
-        let sky = if path.few {
-            Self::sky_share::<FEW_SKY_SAMPLES>
-        } else {
-            Self::sky_share::<SKY_SAMPLES>
-        };
-        let lamp = if path.few {
-            Self::lamp_share::<FEW_LAMP_SAMPLES>
-        } else {
-            Self::lamp_share::<LAMP_SAMPLES>
-        };
         Lit {
             face: face_of(hit),
-            sky: sky(self, &point, &normal, own, path.twist, tile, scratch),
+            sky: self.sky_share(&point, &normal, own, scratch),
             lamp: if normal.dot(&(self.lighting.lamp.center - point)) > 0.0 {
-                lamp(self, &point, own, path.twist, tile, scratch)
+                self.lamp_share(&point, own, scratch)
             } else {
                 0.0
             },
         }
     }
 
-    /// What may hide a light from a point: from the tile's choice if the point is among those it was made for.
-    fn casters_at(
-        &self,
-        light: Light,
-        point: &Point3<f64>,
-        tile: Option<&Tile>,
-        found: &mut Vec<u32>,
-        may_hide: impl Fn(&Bounds) -> bool,
-    ) {
-        match tile.filter(|tile| tile.reach.contains(point)) {
-            Some(tile) => {
-                let list = match light {
-                    Light::Lamp => &tile.lamp,
-                    Light::Sky => &tile.sky,
-                };
-                found.clear();
-                found.extend(
-                    list.iter()
-                        .filter(|&&index| may_hide(&self.scene.bounds()[index as usize])),
-                );
-            }
-            None => self.scene.casters(light, found, may_hide),
-        }
-    }
-
     /// Share of the sky that near things leave to the point, 0..1.
-    fn sky_share<const SAMPLES: usize>(
+    fn sky_share(
         &self,
         point: &Point3<f64>,
         normal: &Vector3<f64>,
         own: Option<u32>,
-        twist: f64,
-        tile: Option<&Tile>,
         scratch: &mut Scratch,
     ) -> f32 {
         let center = point + normal * (SKY_REACH * 0.5);
-        self.casters_at(Light::Sky, point, tile, &mut scratch.casters, |bounds| {
+        let about = Ball {
+            center,
+            radius: SKY_REACH * 0.9,
+        };
+        let casters = &mut scratch.casters;
+        self.scene
+            .casters(Light::Sky)
+            .near(scratch.isa, &about, casters);
+        casters.retain(|&index| {
+            let bounds = &self.scene.bounds()[index as usize];
             let nearest = center.sup(&bounds.min).inf(&bounds.max);
-            (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
+            Some(index) != own
+                && (nearest - center).norm_squared() < SKY_REACH * SKY_REACH * 0.8
                 // Not wholly behind the surface.
                 && normal.dot(&(bounds.center() - point)) + normal.abs().dot(&bounds.half()) > 1e-3
         });
-        scratch.casters.retain(|&index| Some(index) != own);
         if scratch.casters.is_empty() {
             return 1.0;
         }
         let (right, forward) = basis(normal);
-        let mut hidden = 0.0;
-        for (x, y) in seed_points::<SAMPLES>(twist) {
-            let direction =
-                right * x + forward * y + normal * (1.0 - x * x - y * y).max(0.0).sqrt();
-            let ray = Ray {
-                origin: *point,
-                direction,
-            };
-            let mut nearest = SKY_REACH;
-            for &caster in &scratch.casters {
-                let primitive = &self.scene.primitives()[caster as usize];
-                if let Some(crossing) = primitive.shape.crossing(&ray, LIFT, nearest) {
-                    nearest = crossing.t;
-                }
-            }
-            hidden += 1.0 - (nearest / SKY_REACH) as f32;
-        }
-        1.0 - 0.9 * hidden / SAMPLES as f32
+        let [xs, ys] = &*SEEDS;
+        let rays = fan(right.cast(), forward.cast(), |lane| {
+            let (x, y) = (xs[lane], ys[lane]);
+            normal.cast() * (1.0 - x * x - y * y).sqrt()
+        });
+        let mut share = 1.0;
+        sky_left(
+            scratch.isa,
+            self.scene,
+            &scratch.casters,
+            point,
+            &rays,
+            &mut share,
+        );
+        share
     }
 
     /// Share of the lamp that the point sees, 0..1.
-    fn lamp_share<const SAMPLES: usize>(
-        &self,
-        point: &Point3<f64>,
-        own: Option<u32>,
-        twist: f64,
-        tile: Option<&Tile>,
-        scratch: &mut Scratch,
-    ) -> f32 {
+    fn lamp_share(&self, point: &Point3<f64>, own: Option<u32>, scratch: &mut Scratch) -> f32 {
         let lamp = &self.lighting.lamp;
         let axis = lamp.center - point;
         let length = axis.norm();
         let direction = axis / length;
-        self.casters_at(Light::Lamp, point, tile, &mut scratch.casters, |bounds| {
-            in_beam(bounds, point, &direction, length, lamp.radius)
+        let beam = Beam {
+            from: *point,
+            from_radius: 0.0,
+            direction,
+            length,
+            lamp_radius: lamp.radius,
+        };
+        let casters = &mut scratch.casters;
+        self.scene
+            .casters(Light::Lamp)
+            .in_beam(scratch.isa, &beam, casters);
+        casters.retain(|&index| {
+            let bounds = &self.scene.bounds()[index as usize];
+            Some(index) != own && in_beam(bounds, point, &direction, length, lamp.radius)
         });
-        scratch.casters.retain(|&index| Some(index) != own);
         if scratch.casters.is_empty() {
             return 1.0;
         }
         let (right, forward) = basis(&direction);
-        let mut seen = 0.0;
-        for (x, y) in seed_points::<SAMPLES>(twist) {
-            let offset = axis + (right * x + forward * y) * lamp.radius;
-            let distance = offset.norm();
-            let ray = Ray {
-                origin: *point,
-                direction: offset / distance,
-            };
-            let mut share = 1.0;
-            for &caster in &scratch.casters {
-                let primitive = &self.scene.primitives()[caster as usize];
-                if primitive.shape.crossing(&ray, LIFT, distance).is_some() {
-                    share *= if primitive.is_glass() {
-                        GLASS_SHADOW
-                    } else {
-                        0.0
-                    };
-                    if share == 0.0 {
-                        break;
-                    }
-                }
-            }
-            seen += share;
-        }
-        seen / SAMPLES as f32
+        let scaled = |vector: Vector3<f64>| (vector * lamp.radius).cast();
+        let axis: Vector3<f32> = axis.cast();
+        let rays = fan(scaled(right), scaled(forward), |_| axis);
+        let mut share = 1.0;
+        lamp_left(
+            scratch.isa,
+            self.scene,
+            &scratch.casters,
+            point,
+            &rays,
+            &mut share,
+        );
+        share
     }
 }

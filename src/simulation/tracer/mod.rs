@@ -6,40 +6,37 @@
 //! One ray through each pixel's centre gives depth and object; edges and strong contrasts get more for colour. How
 //! much light a point gets does not depend on who looks: cameras side by side look for it once.
 
+mod edges;
+mod flat;
 mod light;
 mod shade;
 mod tiles;
 
 use std::{collections::HashMap, ops::Range};
 
-use arrayvec::ArrayVec;
 use nalgebra::{Point3, Vector3};
 use rayon::prelude::*;
 
-pub use self::{light::LitView, shade::refracted};
 use self::{
-    light::{Face, Lit, UNLIT, face_of},
-    shade::{Paint, plus},
+    edges::{First, Samples},
+    light::{Face, Lit, UNLIT},
+    shade::Paint,
     tiles::{Pyramid, TILE, Tile, overlap, window_of},
 };
+pub use self::{light::LitView, shade::refracted};
 use super::{
     scene::{Finish, Hit, ObjectId, Primitive, Scene},
-    shapes::{Bounds, Crossing, Ray, Shape},
-    texture::{Rgb, scaled},
+    shapes::{Bounds, Crossing, Ray, Shape, within},
+    texture::Rgb,
 };
 use crate::{
     isa::Isa,
+    lanes::{LANES, members},
     model::{camera::Intrinsics, pose::Pose},
 };
 
 /// Metres by which a secondary ray leaves its surface.
 const LIFT: f64 = 1e-7;
-/// Contrast between neighbouring surfaces of one object (relative to the brighter) above which a pixel is sampled again.
-const CONTRAST: f32 = 0.12;
-/// Where in such a pixel it is sampled again, besides its centre: five even steps both across and down, none off the
-/// middle. The first two do as well.
-const SAMPLES: [(f64, f64); 4] = [(0.4, -0.2), (-0.4, 0.2), (0.2, 0.4), (-0.2, -0.4)];
-
 /// A round lamp below the ceiling.
 #[derive(Debug, Clone)]
 pub struct Lamp {
@@ -100,8 +97,8 @@ pub struct Tracer<'a> {
 }
 
 /// Reused per tile.
-#[derive(Default)]
 struct Scratch {
+    isa: Isa,
     casters: Vec<u32>,
     paints: Vec<Option<Paint>>,
     seen: Vec<Seen>,
@@ -110,8 +107,26 @@ struct Scratch {
     beyond: HashMap<(Face, [i32; 3]), Lit>,
 }
 
+impl Scratch {
+    fn new(isa: Isa) -> Self {
+        Self {
+            isa,
+            casters: Vec::new(),
+            paints: Vec::new(),
+            seen: Vec::new(),
+            beyond: HashMap::new(),
+        }
+    }
+}
+
 /// A pixel of a band, the ray through its centre, the cosine that turns its length into depth, and what it meets.
 type Seen = (usize, Path, f64, Option<Hit>);
+
+/// A row of tiles, and those of its pixels that mirror, or let light through.
+struct Band {
+    tiles: Vec<Tile>,
+    shiny: Vec<(usize, Path, Option<Hit>, Option<Paint>)>,
+}
 
 /// A ray on its way.
 #[derive(Clone, Copy)]
@@ -122,10 +137,6 @@ struct Path {
     travelled: f64,
     /// Pixel width, radians.
     spread: f64,
-    /// Turns the sample patterns, 0..1.
-    twist: f64,
-    /// One of several samples of its pixel.
-    few: bool,
     /// Its part in the pixel, 0..1.
     weight: f32,
 }
@@ -137,8 +148,6 @@ struct Near<'a> {
     lit: Option<Lit>,
     /// The light that a camera near by sees.
     view: Option<&'a LitView>,
-    /// What may be in the light's way.
-    tile: Option<&'a Tile>,
     /// The surface itself.
     paint: Option<Paint>,
 }
@@ -150,6 +159,8 @@ struct Eye {
     corner: Vector3<f64>,
     across: Vector3<f64>,
     down: Vector3<f64>,
+    /// Width of a pixel at unit depth.
+    pixel: f64,
 }
 
 impl Eye {
@@ -160,12 +171,31 @@ impl Eye {
             corner: rotation * camera.unproject(0.0, 0.0, 1.0).coords,
             across: rotation * Vector3::new(1.0 / camera.fx, 0.0, 0.0),
             down: rotation * Vector3::new(0.0, 1.0 / camera.fy, 0.0),
+            pixel: 1.0 / camera.fx,
         }
+    }
+
+    /// Direction through image position `(u, v)`, of unit depth.
+    fn towards(&self, u: f64, v: f64) -> Vector3<f64> {
+        self.corner + self.across * u + self.down * v
+    }
+
+    /// [`Self::ray`] at its start.
+    fn path(&self, u: f64, v: f64) -> (Path, f64) {
+        let (ray, cos) = self.ray(u, v);
+        let path = Path {
+            ray,
+            bounces: 0,
+            travelled: 0.0,
+            spread: cos * self.pixel,
+            weight: 1.0,
+        };
+        (path, cos)
     }
 
     /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
     fn ray(&self, u: f64, v: f64) -> (Ray, f64) {
-        let direction = self.corner + self.across * u + self.down * v;
+        let direction = self.towards(u, v);
         let cos = direction.norm().recip();
         let ray = Ray {
             origin: self.origin,
@@ -178,13 +208,6 @@ impl Eye {
 /// Ray through image position `(u, v)` and the cosine that turns its length into depth.
 pub fn camera_ray(camera: &Intrinsics, world_from_camera: &Pose, u: f64, v: f64) -> (Ray, f64) {
     Eye::new(camera, world_from_camera).ray(u, v)
-}
-
-/// A number in 0..1 that differs between neighbouring pixels like noise.
-fn twist_of(column: usize, row: usize) -> f64 {
-    // Jimenez's interleaved gradient noise. Without SSE4.1, `f64::fract` is a call into the C library.
-    let fraction = |x: f64| x - (x as i32 as f64);
-    fraction(52.982_918_9 * fraction(0.067_110_56 * column as f64 + 0.005_837_15 * row as f64))
 }
 
 impl Tracer<'_> {
@@ -212,20 +235,7 @@ impl Tracer<'_> {
         };
         let mut lit = vec![UNLIT; pixels];
         let eye = Eye::new(camera, world_from_camera);
-        let path = |u: f64, v: f64, twist: f64, few: bool| {
-            let (ray, cos) = eye.ray(u, v);
-            let path = Path {
-                ray,
-                bounces: 0,
-                travelled: 0.0,
-                spread: 1.0 / camera.fx,
-                twist,
-                few,
-                weight: 1.0,
-            };
-            (path, cos)
-        };
-        let bands: Vec<Vec<Tile>> = rendering
+        let bands: Vec<Band> = rendering
             .radiance
             .par_chunks_mut(width * TILE)
             .zip(rendering.depth_m.par_chunks_mut(width * TILE))
@@ -234,7 +244,7 @@ impl Tracer<'_> {
             .zip(lit.par_chunks_mut(width * TILE))
             .enumerate()
             .map_init(
-                Scratch::default,
+                || Scratch::new(isa),
                 |scratch, (band, ((((radiance, depth), through), object), lit))| {
                     scratch.beyond.clear();
                     let top = band * TILE;
@@ -245,6 +255,7 @@ impl Tracer<'_> {
                         .filter(|print| overlap(&print.window[1], &rows))
                         .collect();
                     let mut tiles = Vec::with_capacity(width.div_ceil(TILE));
+                    let mut shiny = Vec::new();
                     for left in (0..width).step_by(TILE) {
                         let right = (left + TILE).min(width);
                         let frame = Pyramid::over(
@@ -265,15 +276,25 @@ impl Tracer<'_> {
                         for row in 0..height {
                             for column in left..right {
                                 let (u, v) = (column, top + row);
-                                let (path, cos) = path(u as f64, v as f64, twist_of(u, v), false);
+                                let (path, cos) = eye.path(u as f64, v as f64);
                                 seen.push((row * width + column, path, cos, None));
                             }
                         }
-                        self.look(&tile, &mut seen, left..right, rows.clone());
+                        self.look(isa, &tile, &mut seen, left..right, rows.clone());
                         self.light(&mut tile, &seen, beside, lit, right - left, scratch);
                         let mut paints = std::mem::take(&mut scratch.paints);
-                        self.paint(isa, &seen, &mut paints);
-                        for (&(at, path, cos, hit), &paint) in seen.iter().zip(&paints) {
+                        let painted = self.paint_flat(isa, &seen, lit, radiance);
+                        self.paint(isa, &seen, painted, &mut paints);
+                        let pixels = seen.iter().zip(&paints).enumerate();
+                        for (index, (&(at, path, cos, hit), &paint)) in pixels {
+                            if let Some(hit) = hit
+                                && painted >> index & 1 == 1
+                            {
+                                depth[at] = (hit.crossing.t * cos) as f32;
+                                through[at] = depth[at];
+                                object[at] = self.scene.primitives()[hit.primitive].object;
+                                continue;
+                            }
                             let matte = hit.zip(paint).filter(|(hit, _)| {
                                 let material = &self.scene.primitives()[hit.primitive].material;
                                 material.finish == Finish::Matte
@@ -286,13 +307,7 @@ impl Tracer<'_> {
                                 object[at] = self.scene.primitives()[hit.primitive].object;
                                 continue;
                             }
-                            let near = Near {
-                                lit: Some(lit[at]),
-                                view: beside,
-                                tile: None,
-                                paint,
-                            };
-                            radiance[at] = self.shade(&path, hit.as_ref(), near, scratch);
+                            shiny.push((at, path, hit, paint));
                             let Some(hit) = hit else {
                                 continue;
                             };
@@ -313,88 +328,69 @@ impl Tracer<'_> {
                         scratch.seen = seen;
                         tiles.push(tile);
                     }
-                    tiles
+                    Band { tiles, shiny }
                 },
             )
             .collect();
-        let first = rendering.radiance.clone();
         let view = LitView::new(lit, rendering.depth_m.clone(), *camera, world_from_camera);
-        let lit = &view.lit;
+        rendering
+            .radiance
+            .par_chunks_mut(width * TILE)
+            .zip(&bands)
+            .enumerate()
+            .for_each_init(
+                || Scratch::new(isa),
+                |scratch, (number, (radiance, band))| {
+                    scratch.beyond.clear();
+                    for &(at, ref path, hit, paint) in &band.shiny {
+                        let near = Near {
+                            lit: Some(view.lit[number * width * TILE + at]),
+                            view: Some(&view),
+                            paint,
+                        };
+                        radiance[at] = self.shade(path, hit.as_ref(), near, scratch);
+                    }
+                },
+            );
+        let radiance = rendering.radiance.clone();
+        let first = First {
+            camera,
+            object: &rendering.object,
+            radiance: &radiance,
+            view: &view,
+        };
+        let samples = Samples::new(&eye);
         rendering
             .radiance
             .par_chunks_mut(width)
             .enumerate()
-            .for_each_init(Scratch::default, |scratch, (row, radiance)| {
-                scratch.beyond.clear();
-                for (column, radiance) in radiance.iter_mut().enumerate() {
-                    let more = more_samples(camera, &rendering.object, lit, &first, column, row);
-                    if more == 0 {
-                        continue;
-                    }
-                    let here = row * width + column;
-                    let around = [
-                        Some(here),
-                        (column > 0).then(|| here - 1),
-                        (column + 1 < width).then_some(here + 1),
-                        (row > 0).then(|| here.wrapping_sub(width)),
-                        (row + 1 < camera.height).then_some(here + width),
-                    ];
-                    let tile = &bands[row / TILE][column / TILE];
-                    let clear = around
-                        .into_iter()
-                        .flatten()
-                        .all(|there| lit[there].face != UNLIT.face);
-                    let mut nearby = ArrayVec::<usize, 5>::new();
-                    for at in around.into_iter().flatten() {
-                        let primitive = lit[at].face.0 as usize;
-                        if !nearby.contains(&primitive) {
-                            nearby.push(primitive);
+            .for_each_init(
+                || Scratch::new(isa),
+                |scratch, (row, radiance)| {
+                    scratch.beyond.clear();
+                    for (column, radiance) in radiance.iter_mut().enumerate() {
+                        let tile = &bands[row / TILE].tiles[column / TILE];
+                        let place = (column, row);
+                        if let Some(mixed) = self.edge(&first, &samples, tile, place, scratch) {
+                            *radiance = mixed;
                         }
                     }
-                    // Glass is looked through again for every sample.
-                    let offsets = &SAMPLES[..if clear { more } else { 2 }];
-                    let share = 1.0 / (offsets.len() + 1) as f32;
-                    let mut sum = scaled(*radiance, share);
-                    for (index, &(du, dv)) in offsets.iter().enumerate() {
-                        let twist = twist_of(column, row) + index as f64 * 0.23;
-                        let (path, _) = path(column as f64 + du, row as f64 + dv, twist, true);
-                        // Where there is no glass, what is seen here is seen at one of these pixels.
-                        let hit = if clear {
-                            self.first_of(&path.ray, &nearby)
-                        } else {
-                            None
-                        }
-                        .or_else(|| self.first(&path.ray, tile, column, row));
-                        // What the pixel or one beside it shows of the same face: its texture and light are averaged
-                        // over a pixel already, and do not differ much.
-                        let known = hit.and_then(|hit| {
-                            around
-                                .into_iter()
-                                .flatten()
-                                .find(|&there| lit[there].face == face_of(&hit))
-                        });
-                        let near = Near {
-                            lit: None,
-                            view: Some(&view),
-                            tile: Some(tile),
-                            paint: None,
-                        };
-                        let colour = known.map_or_else(
-                            || self.shade(&path, hit.as_ref(), near, scratch),
-                            |there| first[there],
-                        );
-                        sum = plus(sum, scaled(colour, share));
-                    }
-                    *radiance = sum;
-                }
-            });
+                },
+            );
         (rendering, view)
     }
 }
 
 impl Tracer<'_> {
     /// Finds what each ray of a tile meets.
-    fn look(&self, tile: &Tile, seen: &mut [Seen], columns: Range<usize>, rows: Range<usize>) {
+    fn look(
+        &self,
+        isa: Isa,
+        tile: &Tile,
+        seen: &mut [Seen],
+        columns: Range<usize>,
+        rows: Range<usize>,
+    ) {
         let (across, last) = (columns.len(), seen.len() - 1);
         let flat = self.flat(
             tile,
@@ -421,51 +417,47 @@ impl Tracer<'_> {
                 }
             }
             None => {
-                let places = rows.flat_map(|row| columns.clone().map(move |column| (column, row)));
-                for ((_, path, _, met), (column, row)) in seen.iter_mut().zip(places) {
-                    *met = self.first(&path.ray, tile, column, row);
+                for group in seen.chunks_mut(LANES) {
+                    self.look_at_once(isa, tile, group);
                 }
             }
         }
     }
-}
 
-/// How many more samples a pixel needs: none where it is like its neighbours, all of [`SAMPLES`] where one of them has
-/// another colour, two where one shows another object of about the same colour.
-fn more_samples(
-    camera: &Intrinsics,
-    object: &[ObjectId],
-    lit: &[Lit],
-    radiance: &[Rgb],
-    column: usize,
-    row: usize,
-) -> usize {
-    let width = camera.width;
-    let here = row * width + column;
-    let needed = |there: usize| {
-        // Textures are averaged over the pixel already; what is seen through glass is not.
-        if lit[here].face == lit[there].face && lit[here].face != UNLIT.face {
-            return 0;
+    /// As [`Self::first`] for at most [`LANES`] rays from one point.
+    fn look_at_once(&self, isa: Isa, tile: &Tile, group: &mut [Seen]) {
+        let ray = |lane: usize| &group[lane.min(group.len() - 1)].1.ray;
+        let origin = ray(0).origin;
+        let mut directions = [[0.0; LANES]; 3];
+        for lane in 0..LANES {
+            for axis in 0..3 {
+                directions[axis][lane] = ray(lane).direction[axis] as f32;
+            }
         }
-        let (a, b) = (radiance[here], radiance[there]);
-        let contrast = (0..3).any(|i| (a[i] - b[i]).abs() > CONTRAST * a[i].max(b[i]).max(0.05));
-        match (contrast, object[here] != object[there]) {
-            (true, _) => SAMPLES.len(),
-            (false, true) => 2,
-            (false, false) => 0,
+        let mut nearest = [f32::INFINITY; LANES];
+        for print in &tile.seen {
+            let farthest = nearest[..group.len()].iter().copied().fold(0.0, f32::max);
+            if print.nearest_m > f64::from(farthest) {
+                break;
+            }
+            let shape = &self.scene.primitives()[print.primitive].shape;
+            let mut lanes = 0;
+            within(isa, shape, &origin, &directions, &nearest, &mut lanes);
+            for lane in members(lanes) {
+                let Some((_, path, _, met)) = group.get_mut(lane) else {
+                    break;
+                };
+                let t_max = met.map_or(f64::INFINITY, |hit| hit.crossing.t);
+                if let Some(crossing) = shape.crossing(&path.ray, LIFT, t_max) {
+                    nearest[lane] = crossing.t as f32;
+                    *met = Some(Hit {
+                        crossing,
+                        primitive: print.primitive,
+                    });
+                }
+            }
         }
-    };
-    [
-        (column > 0).then(|| here - 1),
-        (column + 1 < width).then_some(here + 1),
-        (row > 0).then(|| here - width),
-        (row + 1 < camera.height).then_some(here + width),
-    ]
-    .into_iter()
-    .flatten()
-    .map(needed)
-    .max()
-    .unwrap_or(0)
+    }
 }
 
 /// Nearest depth along the optical axis of the primitives alone, metres; infinite where there is none. Used for the

@@ -20,6 +20,8 @@ const MAX_BOUNCES: u32 = 9;
 const FAINT: f32 = 0.045;
 /// Fewer points of a pattern are evaluated one by one.
 const FEW: usize = 3;
+/// Views more oblique than this (square of the cosine) count as this oblique.
+pub(super) const LEAST_COS2: f64 = 2e-3;
 
 /// Direction after refraction at a surface whose `normal` faces against `direction`; `None`: total reflection.
 /// `ratio` is the index on this side over the index beyond (Snell: sin beyond = ratio * sin here).
@@ -64,8 +66,14 @@ pub(super) struct Paint {
 }
 
 impl Tracer<'_> {
-    /// The surface that each of a tile's rays meets. Its pattern is evaluated for many rays at once.
-    pub(super) fn paint(&self, isa: Isa, seen: &[Seen], paints: &mut Vec<Option<Paint>>) {
+    /// The surface that each of a tile's rays, but those `painted` already, meets. Its pattern is evaluated for many rays at once.
+    pub(super) fn paint(
+        &self,
+        isa: Isa,
+        seen: &[Seen],
+        painted: u64,
+        paints: &mut Vec<Option<Paint>>,
+    ) {
         paints.clear();
         let mut spots = [Spot::default(); TILE * TILE];
         // Which rays wait for their colour.
@@ -73,7 +81,7 @@ impl Tracer<'_> {
         for (index, (_, path, _, hit)) in seen.iter().enumerate() {
             let paint = hit.and_then(|hit| {
                 let primitive = &self.scene.primitives()[hit.primitive];
-                if primitive.is_glass() {
+                if primitive.is_glass() || painted >> index & 1 == 1 {
                     return None;
                 }
                 let (normal, cos, spot) = Self::spot(primitive, path, &hit);
@@ -132,11 +140,16 @@ impl Tracer<'_> {
             (surface.normal, cos)
         };
         let travelled = path.travelled + hit.crossing.t;
+        // Along a direction on the surface, a pixel's oblique print is as wide as the pixel, over the cosine of the angle
+        // that the ray makes with the plane across that direction.
+        let width = travelled * path.spread;
+        let along = path.ray.direction.dot(&surface.right).powi(2);
+        let cos2 = (cos * cos).max(LEAST_COS2);
+        let up = (1.0 - cos * cos - along).max(0.0);
         let spot = Spot {
             u: surface.u as f32,
             v: surface.v as f32,
-            // Between the short and the long side of the pixel's oblique print.
-            footprint: (travelled * path.spread / cos.max(0.1).sqrt()) as f32,
+            footprint: [along, up].map(|square| (width * (1.0 + square / cos2).sqrt()) as f32),
         };
         (normal, cos, spot)
     }
@@ -168,7 +181,7 @@ impl Tracer<'_> {
                 let lit = near
                     .lit
                     .or_else(|| near.view?.light_at(hit, &path.ray.at(hit.crossing.t)))
-                    .unwrap_or_else(|| self.light_beyond(path, hit, near.tile, scratch));
+                    .unwrap_or_else(|| self.light_beyond(path, hit, scratch));
                 self.opaque(path, hit, finish, lit, near, scratch)
             }
         }
@@ -249,17 +262,23 @@ impl Tracer<'_> {
         plus(through, scaled(reflected, share))
     }
 
+    /// The light on a surface from everywhere but the lamp.
+    pub(super) fn skylight(&self, normal: &Vector3<f64>) -> Rgb {
+        let lighting = self.lighting;
+        let up = (0.5 + 0.5 * normal.z) as f32;
+        let (towards, window) = &lighting.window;
+        plus(
+            mixed(lighting.ground, lighting.sky, up),
+            scaled(*window, normal.dot(towards).max(0.0) as f32),
+        )
+    }
+
     /// The light that a surface scatters.
     #[inline]
     pub(super) fn diffuse(&self, point: &Point3<f64>, paint: &Paint, lit: Lit) -> Rgb {
         let normal = &paint.normal;
         let lighting = self.lighting;
-        let up = (0.5 + 0.5 * normal.z) as f32;
-        let (towards, window) = &lighting.window;
-        let sky = plus(
-            mixed(lighting.ground, lighting.sky, up),
-            scaled(*window, normal.dot(towards).max(0.0) as f32),
-        );
+        let sky = self.skylight(normal);
         let lamp = &lighting.lamp;
         let to_lamp = lamp.center - point;
         let distance = to_lamp.norm();
@@ -327,7 +346,6 @@ impl Tracer<'_> {
                     travelled,
                     spread: path.spread * 3.0,
                     weight: path.weight * share,
-                    ..*path
                 },
                 near,
                 scratch,

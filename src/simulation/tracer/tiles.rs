@@ -185,23 +185,6 @@ impl Tracer<'_> {
             .collect()
     }
 
-    /// The nearest hit of a ray with one of these primitives.
-    pub(super) fn first_of(&self, ray: &Ray, primitives: &[usize]) -> Option<Hit> {
-        let mut best: Option<Hit> = None;
-        let mut t_max = f64::INFINITY;
-        for &primitive in primitives {
-            let shape = &self.scene.primitives()[primitive].shape;
-            if let Some(crossing) = shape.crossing(ray, LIFT, t_max) {
-                t_max = crossing.t;
-                best = Some(Hit {
-                    crossing,
-                    primitive,
-                });
-            }
-        }
-        best
-    }
-
     /// If all that a tile shows is one flat face: where one of its corner pixels meets it. `corners`: their rays, columns
     /// and rows.
     pub(super) fn flat(&self, tile: &Tile, corners: [(&Ray, usize, usize); 4]) -> Option<Hit> {

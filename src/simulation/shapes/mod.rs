@@ -3,7 +3,11 @@
 //! Metres, world coordinates, z up. Double precision: depth is used as ground truth. Every shape but a [`Frustum`] seen
 //! from inside is convex, so a shape cannot shade itself.
 
+mod packet;
+
 use nalgebra::{Matrix3, Point3, Rotation3, Vector3};
+
+pub use self::packet::{Directions, PLAIN, within};
 
 /// Half a line; `direction` has unit length.
 #[derive(Debug, Clone, Copy)]
@@ -64,6 +68,13 @@ impl Bounds {
     }
 }
 
+/// A sphere that holds a shape.
+#[derive(Debug, Clone, Copy)]
+pub struct Ball {
+    pub center: Point3<f64>,
+    pub radius: f64,
+}
+
 /// Where a ray met a shape. `part` is the face: of a frustum 0 side, 1 base, 2 top; of a solid the number of its plane.
 #[derive(Debug, Clone, Copy)]
 pub struct Crossing {
@@ -75,9 +86,10 @@ pub struct Crossing {
 #[derive(Debug, Clone, Copy)]
 pub struct Surface {
     pub normal: Vector3<f64>,
+    /// The direction in which u grows, of unit length.
+    pub right: Vector3<f64>,
     pub u: f64,
     pub v: f64,
-    pub part: usize,
 }
 
 #[derive(Debug, Clone)]
@@ -204,6 +216,11 @@ impl Solid {
     /// Outward normal and offset of each face: inside is `normal . p <= offset`.
     pub fn planes(&self) -> &[(Vector3<f64>, f64)] {
         &self.planes
+    }
+
+    /// Of a face: where its texture begins, and the directions in which u and v grow.
+    pub fn texture(&self, part: usize) -> (&Point3<f64>, &[Vector3<f64>; 2]) {
+        (&self.origin, &self.axes[part])
     }
 
     /// Where a ray meets the plane of a face, metres along the ray.
@@ -439,9 +456,9 @@ impl Shape {
                 let offset = point - disc.center;
                 Surface {
                     normal: disc.normal,
+                    right: Vector3::x(),
                     u: offset.x,
                     v: offset.y,
-                    part: 0,
                 }
             }
             Self::Solid(solid) => {
@@ -449,9 +466,29 @@ impl Shape {
                 let [right, up] = &solid.axes[part];
                 Surface {
                     normal: solid.planes[part].0,
+                    right: *right,
                     u: offset.dot(right),
                     v: offset.dot(up),
-                    part,
+                }
+            }
+        }
+    }
+
+    pub fn ball(&self) -> Ball {
+        match self {
+            Self::Sphere(sphere) => Ball {
+                center: sphere.center,
+                radius: sphere.radius,
+            },
+            Self::Frustum(frustum) => Ball {
+                center: frustum.base + frustum.axis * (frustum.height * 0.5),
+                radius: (frustum.height * 0.5).hypot(frustum.base_radius.max(frustum.top_radius)),
+            },
+            _ => {
+                let bounds = self.bounds();
+                Ball {
+                    center: bounds.center(),
+                    radius: bounds.half().norm(),
                 }
             }
         }
@@ -482,11 +519,12 @@ impl Shape {
 
 /// Longitude and latitude on a sphere, in metres at its equator.
 fn around(normal: Vector3<f64>, radius: f64) -> Surface {
+    let beside = normal.x.hypot(normal.y).max(1e-9);
     Surface {
         normal,
+        right: Vector3::new(-normal.y, normal.x, 0.0) / beside,
         u: normal.y.atan2(normal.x) * radius,
         v: normal.z.clamp(-1.0, 1.0).asin() * radius,
-        part: 0,
     }
 }
 
@@ -549,19 +587,21 @@ impl Frustum {
     fn surface(&self, point: &Point3<f64>, part: usize) -> Surface {
         let offset = point - self.base;
         let (x, y) = (offset.dot(&self.right), offset.dot(&self.forward));
-        let (u, v) = if part == 0 {
+        let normal = self.normal(point, part);
+        let (right, u, v) = if part == 0 {
             (
+                (self.forward * x - self.right * y) / x.hypot(y),
                 y.atan2(x) * 0.5 * (self.base_radius + self.top_radius),
                 offset.dot(&self.axis),
             )
         } else {
-            (x, y)
+            (self.right, x, y)
         };
         Surface {
-            normal: self.normal(point, part),
+            normal,
+            right,
             u,
             v,
-            part,
         }
     }
 }
