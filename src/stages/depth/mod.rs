@@ -28,6 +28,7 @@ pub use sides::SidesDepth;
 
 use crate::isa::Isa;
 use contrast::Contrasts;
+use exposure_match::Exposure;
 use plane_sweep::{Middle, Sweep};
 use rayon::prelude::*;
 use refine::Refiner;
@@ -169,15 +170,17 @@ impl DepthEstimator {
             "one expected depth a pixel"
         );
         let cameras = [(rig.left, left_y), (rig.right, right_y)];
-        for (side, (camera, luminance)) in self.sides.iter_mut().zip(cameras) {
+        let mut exposures = [Exposure::SAME; 2];
+        let sides = self.sides.iter_mut().zip(&mut exposures);
+        for ((side, exposure), (camera, luminance)) in sides.zip(cameras) {
             if let Some(camera) = camera {
                 assert_eq!(
                     luminance.len(),
                     camera.intrinsics.pixels(),
                     "a side image has its camera's size"
                 );
-                let exposure = exposure_match::match_exposure(middle_y, luminance);
-                side.turn(&rig.middle, &camera, range, &exposure, luminance);
+                *exposure = Exposure::matching(middle_y, luminance).unless_unnoticed();
+                side.turn(&rig.middle, &camera, range, &exposure.table(), luminance);
             }
         }
         let (isa, settings) = (self.isa, &self.settings);
@@ -223,10 +226,21 @@ impl DepthEstimator {
             || sweep.scratch(),
             |scratch, y, row| sweep.fill_row(scratch, y, row),
         );
-        // Who stands in front of whom is known only after a first answer; then a side has no vote where it has no view.
+        // Which pixels show the same, and who stands in front of whom, is known only after a first answer; then a side
+        // has no vote where it has no view.
         let coarse = propagation.solve_coarse();
-        for side in &mut self.sides {
-            side.block(range, coarse, &rig.middle, 2);
+        let sides = self.sides.iter_mut().zip(exposures);
+        for ((side, first), (camera, luminance)) in sides.zip(cameras) {
+            if let Some(camera) = camera {
+                let (middle_y, side_y) = side.counterparts(range, coarse, middle_y, &rig.middle, 2);
+                let known = Exposure::matching(&middle_y, &side_y)
+                    .after(first)
+                    .unless_unnoticed();
+                if known != first {
+                    side.turn(&rig.middle, &camera, range, &known.table(), luminance);
+                }
+                side.block(range, coarse, &rig.middle, 2);
+            }
         }
         let sides = turned(rig, &self.sides);
         let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range);
