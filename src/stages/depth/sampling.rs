@@ -227,12 +227,9 @@ fn fill_phases_kernel<V: Lanes>(
             let before = &phases[begin(-radius)..][..n];
             let here = &phases[begin(0)..][..n];
             let after = &phases[begin(radius)..][..n];
-            let low = &mut low[q * line..][..n];
+            let (low, high) = (&mut low[q * line..][..n], &mut high[q * line..][..n]);
             for i in 0..n {
                 low[i] = before[i].min(here[i]).min(after[i]);
-            }
-            let high = &mut high[q * line..][..n];
-            for i in 0..n {
                 high[i] = before[i].max(here[i]).max(after[i]);
             }
         }
