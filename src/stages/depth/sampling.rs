@@ -294,7 +294,6 @@ fn fill_free(
                     (*scale, *x0, *y0),
                     y,
                     4 * quarters,
-                    board.width,
                     scratch,
                     values,
                     blockers,
@@ -321,7 +320,7 @@ fn fill_free(
 
 for_each_isa! {
     unsafe fn sample_row = sample_row_kernel(
-        side: &Side, motion: (f64, f64, f64), y: usize, up: u16, width: usize, scratch: &mut [u8], values: &mut [u8], blockers: &mut [u8],
+        side: &Side, motion: (f64, f64, f64), y: usize, up: u16, scratch: &mut [u8], values: &mut [u8], blockers: &mut [u8],
     )
 }
 
@@ -331,11 +330,12 @@ fn sample_row_kernel<V: Lanes>(
     (scale, x0, y0): (f64, f64, f64),
     y: usize,
     up: u16,
-    width: usize,
     scratch: &mut [u8],
     values: &mut [u8],
     blockers: &mut [u8],
 ) {
+    // Rows are one longer than the image.
+    let width = values.len() - 1;
     let sixteenths = ((y as f64 * scale + y0 + side.margin_rows as f64) * 16.0).round() as i64;
     let rows = (side.luminance.len() / side.width) as i64;
     let (upper, weight) = (sixteenths.div_euclid(16), sixteenths.rem_euclid(16) as u16);
