@@ -64,7 +64,7 @@ fn main() {
             let (start, used) = (Instant::now(), processor_ms());
             estimator.estimate(
                 &rig,
-                &scene.middle_y,
+                &scene.middle_rgb,
                 &scene.left_y,
                 &scene.right_y,
                 &range,

@@ -4,14 +4,14 @@
     target/venv/bin/python benches/depth_against_sgbm.py ../shared/data/tsukuba
 
 Prints the time of the processor for one thread and of the clock for two, best and median of the repetitions in turns.
-A Xeon with AVX-512, two cores; median milliseconds, and their share of SGBM's median; 64 labels. One thread: of the
-processor. Two threads: of the clock, on a machine whose cores others used too.
+A Xeon with AVX-512, two cores; milliseconds, and their share of SGBM's; 64 labels. One thread: of the processor, the median.
+Two threads: of the clock, the best of 40, as others used both cores meanwhile.
 
     size     threads  SGBM-HH, 2 cameras  ours, 3 cameras  ours, 2 cameras
-    320x240  1         14.4               13.9 (0.97)      13.2 (0.92)
-    320x240  2         20.3               21.3 (1.05)      20.2 (1.00)
-    640x480  1         89.3               49.3 (0.55)      45.0 (0.50)
-    640x480  2        124.0               66.2 (0.53)      60.1 (0.48)
+    320x240  1         13.8               14.8 (1.07)      13.1 (0.95)
+    320x240  2         19.6               18.7 (0.95)      15.4 (0.78)
+    640x480  1        106.0               51.6 (0.49)      47.5 (0.45)
+    640x480  2        194.9              111.7 (0.57)      96.2 (0.49)
 """
 
 import pathlib

@@ -541,10 +541,13 @@ impl Pipeline {
             });
         }
         let expected_m = self.expected_depth(frame);
-        let image = frame.image.grey();
         let computed = self.pool.install(|| {
-            self.sides_depth
-                .compute(&frame.intrinsics, &image, sides, expected_m.as_deref())
+            self.sides_depth.compute(
+                &frame.intrinsics,
+                &frame.image,
+                sides,
+                expected_m.as_deref(),
+            )
         });
         let (inverse_depth, computed_m) = (computed.label_step * LABELS_JOINED, &computed.depth_m);
         self.workspace.cut = MeshCut {

@@ -107,10 +107,11 @@ impl Scene {
             left,
             right,
         } = self;
+        let middle_rgb: Vec<[u8; 3]> = middle.luminance.iter().map(|y| [*y; 3]).collect();
         estimator
             .estimate(
                 rig,
-                &middle.luminance,
+                &middle_rgb,
                 &left.luminance,
                 &right.luminance,
                 &range(),

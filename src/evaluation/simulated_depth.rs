@@ -97,7 +97,7 @@ pub fn evaluate(script: &Script, frames: &[u64], range: InverseDepthRange) -> Wi
             .expect("all cameras were rendered");
         let middle = &capture.middle;
         let quarters_m = quartered.capture(0, frame, Views::Middle).middle.depth_m;
-        let computed = depth.compute(&intrinsics, &middle.image.grey(), &sides, None);
+        let computed = depth.compute(&intrinsics, &middle.image, &sides, None);
         for (pixel, &computed_m) in computed.depth_m.iter().enumerate() {
             let near = |true_m: f32| {
                 computed_m > 0.0 && (1.0 / computed_m - 1.0 / true_m).abs() <= computed.label_step

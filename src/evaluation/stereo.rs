@@ -15,7 +15,7 @@ pub struct StereoScene {
     pub width: usize,
     pub height: usize,
     pub left_y: Vec<u8>,
-    pub middle_y: Vec<u8>,
+    pub middle_rgb: Vec<[u8; 3]>,
     pub right_y: Vec<u8>,
     /// Pixels between neighbouring cameras, of the middle image; 0 = not known.
     pub disparity: Vec<f32>,
@@ -85,7 +85,7 @@ impl StereoScene {
             width: expected.0 as usize,
             height: expected.1 as usize,
             left_y: grey(&left),
-            middle_y: grey(&middle),
+            middle_rgb: middle.to_rgb8().pixels().map(|pixel| pixel.0).collect(),
             right_y: grey(&right),
             disparity,
         })
@@ -130,7 +130,7 @@ impl StereoScene {
         estimator
             .estimate(
                 &self.rig(cameras),
-                &self.middle_y,
+                &self.middle_rgb,
                 &self.left_y,
                 &self.right_y,
                 range,

@@ -142,8 +142,8 @@ pub fn recording(dir: &Path, script: &Script, options: &Options) -> Result<Summa
         let sides = script.sides(options.station, &capture);
         let depth_m = match (&mut computed, &sides) {
             (Some(computed), Some(sides)) => {
-                let image = capture.middle.image.grey();
-                &computed.compute(camera, &image, sides, None).depth_m
+                let image = &capture.middle.image;
+                &computed.compute(camera, image, sides, None).depth_m
             }
             _ if options.truth == Truth::Exact => &capture.middle.depth_m,
             _ => &capture.depth_m,

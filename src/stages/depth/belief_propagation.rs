@@ -4,7 +4,7 @@
 //! Open in the paper: everything but the method. Chosen: messages of 8 bits, which lose nothing: no message exceeds
 //! its truncation d, so a cost of more than its pixel's least + 4 d never changes a message nor wins, and is cut at
 //! least + 4 d + 1; with d <= 31, the sum of a cost and four messages is at most 249. Two smoothness classes, so that
-//! depth may jump where luminance does, at each level. Coarser levels sum the costs of 2x2 pixels exactly (in 16 bits,
+//! depth may jump where colour does, at each level. Coarser levels sum the costs of 2x2 pixels exactly (in 16 bits,
 //! cut likewise per level).
 //!
 //! Time goes into memory, not arithmetic, if each iteration walks the whole volume. So the iterations follow one
@@ -37,9 +37,9 @@ impl Smoothness {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PropagationSettings {
-    /// Between neighbours of like luminance.
+    /// Between neighbours of like colour.
     pub smooth: Smoothness,
-    /// Between neighbours of unlike luminance.
+    /// Between neighbours of unlike colour.
     pub across_contrast: Smoothness,
     /// Resolutions, each half the one before; 1 to [`MOST_LEVELS`](Self::MOST_LEVELS).
     pub levels: usize,
@@ -57,7 +57,7 @@ impl PropagationSettings {
     }
 }
 
-/// Where neighbours differ in luminance: one byte a pixel, 0 = alike.
+/// Where neighbours differ in colour: one byte a pixel, 0 = alike.
 #[derive(Debug, Clone, Default)]
 pub struct Contrast {
     /// Between a pixel and the one to its right.

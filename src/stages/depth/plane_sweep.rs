@@ -2,7 +2,8 @@
 //! middle image lies at each hypothesis, by its luminance in the left and in the right image.
 //! In: luminance of two or three cameras, the rig, the range of inverse depth (1/m). Out: a cost volume, grey levels.
 //! Open in the paper: the cost. Chosen: per side the difference to the interval of luminance that the hypothesis and
-//! its halves towards the next ones span (Birchfield and Tomasi 1998), cut at `most_difference`; of the two sides
+//! its halves towards the next ones span (Birchfield and Tomasi 1998), twice where there is little texture,
+//! cut at `most_difference`; of the two sides
 //! the mean, but where they disagree no more than the better one and `occlusion`, as the other camera may not see the
 //! point; a side that looks past its image has no vote. Exposure of the side images is matched to the middle's.
 
@@ -40,6 +41,8 @@ impl SweepSettings {
 pub(super) struct Middle<'a> {
     pub intrinsics: &'a Intrinsics,
     pub luminance: &'a [u8],
+    /// 255 where a difference counts twice, else 0.
+    pub weak: &'a [u8],
     /// Metres, 0 = none.
     pub expected_depth_m: Option<&'a [f32]>,
 }
@@ -53,23 +56,27 @@ pub(super) struct Sweep<'a> {
     samplers: [Sampler<'a>; 2],
     tolerance: usize,
     board: Checkerboard,
+    /// Samples in half grey levels, not whole ones.
+    fine: bool,
 }
 
 /// What one thread fills rows with.
 pub(super) struct Scratch {
     strips: [Strip; 2],
     luminance: Vec<u8>,
+    weak: Vec<u8>,
     expected: Vec<u8>,
 }
 
 impl<'a> Sweep<'a> {
-    /// Both sides have been turned.
+    /// Both sides have been turned. `fine` costs time that a first answer does not need.
     pub fn new(
         isa: Isa,
         settings: &'a SweepSettings,
         middle: Middle<'a>,
         sides: [Option<&'a Side>; 2],
         range: &'a InverseDepthRange,
+        fine: bool,
     ) -> Self {
         let board = Checkerboard::new(middle.intrinsics.width, middle.intrinsics.height);
         let samplers = sides.map(|side| Sampler::new(side, middle.intrinsics, range));
@@ -87,6 +94,7 @@ impl<'a> Sweep<'a> {
             samplers,
             tolerance,
             board,
+            fine,
         }
     }
 
@@ -95,6 +103,7 @@ impl<'a> Sweep<'a> {
         Scratch {
             strips: [0, 1].map(|side| self.samplers[side].strip(self.range.labels, &self.board)),
             luminance: line.clone(),
+            weak: line.clone(),
             expected: line,
         }
     }
@@ -110,11 +119,12 @@ impl<'a> Sweep<'a> {
         let Scratch {
             strips,
             luminance,
+            weak,
             expected,
         } = scratch;
         let labels = range.labels;
         for (sampler, strip) in self.samplers.iter().zip(strips.iter_mut()) {
-            sampler.fill(self.isa, y, board, strip);
+            sampler.fill(self.isa, y, board, self.fine, strip);
         }
         let pixels = y * board.width..(y + 1) * board.width;
         let colour_bytes = row.bytes.len() / 2;
@@ -125,6 +135,10 @@ impl<'a> Sweep<'a> {
                 .skip(parity)
                 .step_by(2);
             for (to, from) in luminance.iter_mut().zip(here) {
+                *to = *from;
+            }
+            let here = middle.weak[pixels.clone()].iter().skip(parity);
+            for (to, from) in weak.iter_mut().zip(here.step_by(2)) {
                 *to = *from;
             }
             if let Some(depth_m) = middle.expected_depth_m {
@@ -142,11 +156,13 @@ impl<'a> Sweep<'a> {
             }
             let half_row = HalfRow {
                 luminance,
+                weak,
                 expected: middle.expected_depth_m.map(|_| &expected[..]),
                 strips,
                 parity,
                 tolerance: self.tolerance,
                 board,
+                fine: self.fine,
             };
             half_row.check(labels, costs);
             let isa = if board.half < 64 {
@@ -172,24 +188,29 @@ const NOT_EXPECTED: u8 = 255;
 
 struct HalfRow<'a> {
     luminance: &'a [u8],
+    weak: &'a [u8],
     expected: Option<&'a [u8]>,
     strips: &'a [Strip; 2],
     parity: usize,
     /// Labels by which a blocker must be nearer.
     tolerance: usize,
     board: &'a Checkerboard,
+    fine: bool,
 }
 
 impl HalfRow<'_> {
     fn check(&self, labels: usize, costs: &[u8]) {
         let reach = self.board.half.max(32);
         assert!(self.luminance.len() >= reach && costs.len() >= labels * self.board.stride);
+        assert!(self.weak.len() >= reach);
         assert!(self.expected.is_none_or(|expected| expected.len() >= reach));
         for strip in self.strips {
             let end =
                 |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
             assert!(strip.at.len() == labels && strip.blocker_at.len() == labels);
-            assert!(strip.low.len().min(strip.high.len()) >= end(&strip.at));
+            let samples_end = end(&strip.at);
+            let mut samples = strip.low.iter().chain(&strip.high);
+            assert!(samples.all(|samples| samples.len() >= samples_end));
             assert!(strip.blocker.len() >= end(&strip.blocker_at));
         }
     }
@@ -211,12 +232,14 @@ unsafe fn cost_kernel<V: Lanes>(
     let Checkerboard { half, stride, .. } = *row.board;
     // SAFETY: see `sweep`.
     unsafe {
-        let most = V::splat(settings.most_difference);
-        let occlusion = V::splat(settings.occlusion);
+        // Half levels, up to the mean of the two sides.
+        let most = V::splat(settings.most_difference.saturating_mul(2));
+        let occlusion = V::splat(settings.occlusion.saturating_mul(2));
+        let unseen = V::splat(settings.unseen.saturating_mul(2));
         let most_surprise = V::splat(settings.most_surprise);
-        let unseen = V::splat(settings.unseen);
         for start in Checkerboard::vector_starts(half, V::N) {
             let luminance = V::load(row.luminance.as_ptr().add(start));
+            let weak = V::load(row.weak.as_ptr().add(start));
             for label in 0..labels {
                 // Plain loops: a closure would be a function of its own, without the vector instructions.
                 let mut differences = [most; 2];
@@ -224,12 +247,16 @@ unsafe fn cost_kernel<V: Lanes>(
                 for side in 0..2 {
                     let strip = &row.strips[side];
                     let at = strip.at.get_unchecked(label)[row.parity] + start;
-                    let low = V::load(strip.low.as_ptr().add(at));
-                    let high = V::load(strip.high.as_ptr().add(at));
-                    let difference = luminance
-                        .sub_saturating(high)
-                        .max(low.sub_saturating(luminance));
-                    differences[side] = difference.min(most);
+                    let mut difference = V::splat(0);
+                    for rounding in [0, usize::from(row.fine)] {
+                        let low = V::load(strip.low[rounding].as_ptr().add(at));
+                        let high = V::load(strip.high[rounding].as_ptr().add(at));
+                        let rounded = luminance
+                            .sub_saturating(high)
+                            .max(low.sub_saturating(luminance));
+                        difference = difference.add_saturating(rounded);
+                    }
+                    differences[side] = difference.add_saturating(difference.min(weak)).min(most);
                     let blocker_at = strip.blocker_at.get_unchecked(label)[row.parity] + start;
                     blockers[side] = V::load(strip.blocker.as_ptr().add(blocker_at));
                 }
@@ -237,8 +264,9 @@ unsafe fn cost_kernel<V: Lanes>(
                 let passes = V::splat((label + row.tolerance).min(OUTSIDE as usize - 1) as u8);
                 let l = left.replace_where_less(passes, left_blocker, right);
                 let r = right.replace_where_less(passes, right_blocker, left);
-                let mut cost = l.average(r).min(l.min(r).add(occlusion));
+                let mut cost = l.average(r).min(l.min(r).add_saturating(occlusion));
                 cost = cost.replace_where_less(passes, left_blocker.min(right_blocker), unseen);
+                cost = cost.average(V::splat(0));
                 if let Some(expected) = row.expected {
                     let expected = V::load(expected.as_ptr().add(start));
                     let here = V::splat(label as u8);
@@ -248,7 +276,7 @@ unsafe fn cost_kernel<V: Lanes>(
                         .min(most_surprise);
                     let away =
                         away.replace_where_less(V::splat(NOT_EXPECTED - 1), expected, V::splat(0));
-                    cost = cost.add(away);
+                    cost = cost.add_saturating(away);
                 }
                 cost.store(costs.as_mut_ptr().add(label * stride + start));
             }

@@ -1,5 +1,6 @@
 //! Where each hypothesis finds a row of the middle image in a side image: samples, and the interval of luminance that
-//! a hypothesis and its halves towards the next ones span.
+//! a hypothesis and its halves towards the next ones span. In half grey levels, as dark wood has few: whole levels would
+//! make depths cheap whose samples fall on pixels, all over a plain surface.
 //! In: a turned side image. Out: a [`Strip`] a row. A rig that shifts along rows alone takes its samples from one table a
 //! row of eight sub-pixel phases; any other has each hypothesis' row sampled by itself.
 
@@ -11,6 +12,11 @@ use super::{
 };
 use crate::{isa::Isa, model::camera::Intrinsics};
 
+/// Of a level, added before it is cut off: the two roundings of a [`Strip`], or one if it is not `fine`.
+fn roundings(fine: bool) -> &'static [u16] {
+    if fine { &[1, 3] } else { &[2] }
+}
+
 /// Sub-pixel phases of the tables.
 const PHASES: usize = 8;
 
@@ -20,9 +26,11 @@ pub(super) const VECTOR_SLACK: usize = 64;
 /// Samples of one side for one row: where each label's are.
 #[derive(Default, Clone)]
 pub(super) struct Strip {
-    /// Least, greatest luminance of each sample's interval, and what blocks its view.
-    pub low: Vec<u8>,
-    pub high: Vec<u8>,
+    /// Least, greatest luminance of each sample's interval, once rounded up above a quarter and once above three
+    /// quarters of a level: their sum is in half levels. Where it is not `fine`, the first alone, rounded as usual.
+    pub low: [Vec<u8>; 2],
+    pub high: [Vec<u8>; 2],
+    /// What blocks the view of a sample.
     pub blocker: Vec<u8>,
     /// `[label][parity]`: first sample of the half row, in `low` and `high` and in `blocker`.
     pub at: Vec<[usize; 2]>,
@@ -36,8 +44,8 @@ impl Strip {
         let none = vec![0; half + VECTOR_SLACK];
         let at = vec![[0; 2]; labels];
         Self {
-            low: none.clone(),
-            high: none,
+            low: [none.clone(), none.clone()],
+            high: [none.clone(), none],
             blocker: vec![OUTSIDE; half + VECTOR_SLACK],
             blocker_at: at.clone(),
             at,
@@ -114,8 +122,8 @@ impl<'a> Sampler<'a> {
                     (x % 2 * 2 + phase.min(1)) * line + x / 2
                 };
                 Strip {
-                    low: vec![0; 2 * PHASES * line],
-                    high: vec![0; 2 * PHASES * line],
+                    low: [(); 2].map(|()| vec![0; 2 * PHASES * line]),
+                    high: [(); 2].map(|()| vec![0; 2 * PHASES * line]),
                     blocker: vec![OUTSIDE; 4 * line],
                     at: eighths
                         .iter()
@@ -134,8 +142,8 @@ impl<'a> Sampler<'a> {
                     .map(|label| [0, 1].map(|parity| (label * 2 + parity) * line))
                     .collect();
                 Strip {
-                    low: vec![0; labels * 2 * line],
-                    high: vec![0; labels * 2 * line],
+                    low: [(); 2].map(|()| vec![0; labels * 2 * line]),
+                    high: [(); 2].map(|()| vec![0; labels * 2 * line]),
                     blocker: vec![OUTSIDE; labels * 2 * line],
                     blocker_at: at.clone(),
                     at,
@@ -145,7 +153,7 @@ impl<'a> Sampler<'a> {
         }
     }
 
-    pub fn fill(&self, isa: Isa, y: usize, board: &Checkerboard, strip: &mut Strip) {
+    pub fn fill(&self, isa: Isa, y: usize, board: &Checkerboard, fine: bool, strip: &mut Strip) {
         match self {
             Self::Blind => {}
             Self::Rows { side, radius, .. } => {
@@ -153,21 +161,27 @@ impl<'a> Sampler<'a> {
                 let row = &side.luminance[from..from + side.width];
                 let blocker = &side.blocker[from..from + side.width];
                 // SAFETY: `isa` is available; the kernel is safe code.
-                unsafe { fill_phases(isa, row, blocker, *radius, strip) };
+                unsafe { fill_phases(isa, row, blocker, *radius, fine, strip) };
             }
-            Self::Free { side, motions } => fill_free(isa, side, motions, y, board, strip),
+            Self::Free { side, motions } => fill_free(isa, side, motions, y, board, fine, strip),
         }
     }
 }
 
 for_each_isa! {
-    unsafe fn fill_phases = fill_phases_kernel(row: &[u8], blocker: &[u8], radius: isize, strip: &mut Strip)
+    unsafe fn fill_phases = fill_phases_kernel(row: &[u8], blocker: &[u8], radius: isize, fine: bool, strip: &mut Strip)
 }
 
 /// The row at eight sub-pixel phases, even and odd pixels apart, with the interval to `radius` eighths around. Sample `i`
 /// of phase `q` in 0..16 stands at pixel `2 i + q / 8`.
 #[inline(always)]
-fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip: &mut Strip) {
+fn fill_phases_kernel<V: Lanes>(
+    row: &[u8],
+    blocker: &[u8],
+    radius: isize,
+    fine: bool,
+    strip: &mut Strip,
+) {
     let line = row.len().div_ceil(2) + VECTOR_SLACK;
     let n = row.len().div_ceil(2);
     let Strip {
@@ -184,41 +198,40 @@ fn fill_phases_kernel<V: Lanes>(row: &[u8], blocker: &[u8], radius: isize, strip
     part(row, row_even, row_odd);
     part(blocker, blocker_even, blocker_odd);
     // One sample of margin at the front, for intervals that begin before the row, and one at the end.
-    for phase in 0..PHASES {
-        let (w1, w0) = (phase as u16, (PHASES - phase) as u16);
-        let half = PHASES as u16 / 2;
-        let even = &mut phases[phase * line..][..n + 2];
-        for i in 0..n {
-            even[1 + i] = ((u16::from(row_even[i]) * w0 + u16::from(row_odd[i]) * w1 + half)
-                / PHASES as u16) as u8;
+    for ((low, high), quarters) in low.iter_mut().zip(high).zip(roundings(fine)) {
+        let up = quarters * PHASES as u16 / 4;
+        for phase in 0..PHASES {
+            let (w1, w0) = (phase as u16, (PHASES - phase) as u16);
+            let even = &mut phases[phase * line..][..n + 2];
+            for i in 0..n {
+                even[1 + i] = ((u16::from(row_even[i]) * w0 + u16::from(row_odd[i]) * w1 + up)
+                    / PHASES as u16) as u8;
+            }
+            (even[0], even[n + 1]) = (even[1], even[n]);
+            let odd = &mut phases[(PHASES + phase) * line..][..n + 2];
+            for i in 0..n {
+                odd[1 + i] = ((u16::from(row_odd[i]) * w0 + u16::from(row_even[i + 1]) * w1 + up)
+                    / PHASES as u16) as u8;
+            }
+            (odd[0], odd[n + 1]) = (odd[1], odd[n]);
         }
-        (even[0], even[n + 1]) = (even[1], even[n]);
-        let odd = &mut phases[(PHASES + phase) * line..][..n + 2];
-        for i in 0..n {
-            odd[1 + i] = ((u16::from(row_odd[i]) * w0 + u16::from(row_even[i + 1]) * w1 + half)
-                / PHASES as u16) as u8;
-        }
-        (odd[0], odd[n + 1]) = (odd[1], odd[n]);
-    }
-    for q in 0..2 * PHASES {
-        let begin = |eighths: isize| {
-            let at = q as isize + eighths;
-            let (pairs, q) = (
-                at.div_euclid(2 * PHASES as isize),
-                at.rem_euclid(2 * PHASES as isize) as usize,
-            );
-            q * line + (1 + pairs) as usize
-        };
-        let before = &phases[begin(-radius)..][..n];
-        let here = &phases[begin(0)..][..n];
-        let after = &phases[begin(radius)..][..n];
-        let low = &mut low[q * line..][..n];
-        for i in 0..n {
-            low[i] = before[i].min(here[i]).min(after[i]);
-        }
-        let high = &mut high[q * line..][..n];
-        for i in 0..n {
-            high[i] = before[i].max(here[i]).max(after[i]);
+        for q in 0..2 * PHASES {
+            let begin = |eighths: isize| {
+                let at = q as isize + eighths;
+                let (pairs, q) = (
+                    at.div_euclid(2 * PHASES as isize),
+                    at.rem_euclid(2 * PHASES as isize) as usize,
+                );
+                q * line + (1 + pairs) as usize
+            };
+            let before = &phases[begin(-radius)..][..n];
+            let here = &phases[begin(0)..][..n];
+            let after = &phases[begin(radius)..][..n];
+            let (low, high) = (&mut low[q * line..][..n], &mut high[q * line..][..n]);
+            for i in 0..n {
+                low[i] = before[i].min(here[i]).min(after[i]);
+                high[i] = before[i].max(here[i]).max(after[i]);
+            }
         }
     }
     // A sample between two pixels needs both.
@@ -255,6 +268,7 @@ fn fill_free(
     motions: &[(f64, f64, f64)],
     y: usize,
     board: &Checkerboard,
+    fine: bool,
     strip: &mut Strip,
 ) {
     let Strip {
@@ -267,35 +281,38 @@ fn fill_free(
     } = strip;
     let (scratch, samples) = scratch.split_at_mut(2 * (side.width + 2));
     let (values, blockers) = samples.split_at_mut(motions.len() * (board.width + 1));
-    let rows = values
-        .chunks_exact_mut(board.width + 1)
-        .zip(blockers.chunks_exact_mut(board.width + 1));
-    for ((scale, x0, y0), (values, blockers)) in motions.iter().zip(rows) {
-        // SAFETY: `isa` is available; the kernel is safe code.
-        unsafe {
-            sample_row(
-                isa,
-                side,
-                (*scale, *x0, *y0),
-                y,
-                board.width,
-                scratch,
-                values,
-                blockers,
-            )
-        };
-    }
-    let row =
-        |values: &[u8], half_label: usize, x: usize| values[half_label * (board.width + 1) + x];
-    for (label, at) in at.iter().enumerate() {
-        for (parity, at) in at.iter().enumerate() {
-            for i in 0..(board.width - parity).div_ceil(2) {
-                let x = 2 * i + parity;
-                let of = |half_label: usize| row(values, half_label, x);
-                let (before, here, after) = (of(2 * label), of(2 * label + 1), of(2 * label + 2));
-                low[at + i] = before.min(here).min(after);
-                high[at + i] = before.max(here).max(after);
-                blocker[at + i] = row(blockers, 2 * label + 1, x);
+    for ((low, high), quarters) in low.iter_mut().zip(high).zip(roundings(fine)) {
+        let rows = values
+            .chunks_exact_mut(board.width + 1)
+            .zip(blockers.chunks_exact_mut(board.width + 1));
+        for ((scale, x0, y0), (values, blockers)) in motions.iter().zip(rows) {
+            // SAFETY: `isa` is available; the kernel is safe code.
+            unsafe {
+                sample_row(
+                    isa,
+                    side,
+                    (*scale, *x0, *y0),
+                    y,
+                    4 * quarters,
+                    scratch,
+                    values,
+                    blockers,
+                )
+            };
+        }
+        let row =
+            |values: &[u8], half_label: usize, x: usize| values[half_label * (board.width + 1) + x];
+        for (label, at) in at.iter().enumerate() {
+            for (parity, at) in at.iter().enumerate() {
+                for i in 0..(board.width - parity).div_ceil(2) {
+                    let x = 2 * i + parity;
+                    let of = |half_label: usize| row(values, half_label, x);
+                    let (before, here, after) =
+                        (of(2 * label), of(2 * label + 1), of(2 * label + 2));
+                    low[at + i] = before.min(here).min(after);
+                    high[at + i] = before.max(here).max(after);
+                    blocker[at + i] = row(blockers, 2 * label + 1, x);
+                }
             }
         }
     }
@@ -303,7 +320,7 @@ fn fill_free(
 
 for_each_isa! {
     unsafe fn sample_row = sample_row_kernel(
-        side: &Side, motion: (f64, f64, f64), y: usize, width: usize, scratch: &mut [u8], values: &mut [u8], blockers: &mut [u8],
+        side: &Side, motion: (f64, f64, f64), y: usize, up: u16, scratch: &mut [u8], values: &mut [u8], blockers: &mut [u8],
     )
 }
 
@@ -312,11 +329,13 @@ fn sample_row_kernel<V: Lanes>(
     side: &Side,
     (scale, x0, y0): (f64, f64, f64),
     y: usize,
-    width: usize,
+    up: u16,
     scratch: &mut [u8],
     values: &mut [u8],
     blockers: &mut [u8],
 ) {
+    // Rows are one longer than the image.
+    let width = values.len() - 1;
     let sixteenths = ((y as f64 * scale + y0 + side.margin_rows as f64) * 16.0).round() as i64;
     let rows = (side.luminance.len() / side.width) as i64;
     let (upper, weight) = (sixteenths.div_euclid(16), sixteenths.rem_euclid(16) as u16);
@@ -329,7 +348,7 @@ fn sample_row_kernel<V: Lanes>(
     let (blend, blocked) = scratch.split_at_mut(side.width + 2);
     let (a, b) = side.luminance[upper..upper + 2 * side.width].split_at(side.width);
     for ((to, a), b) in blend.iter_mut().zip(a).zip(b) {
-        *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + 8) / 16) as u8;
+        *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + up) / 16) as u8;
     }
     let (a, b) = side.blocker[upper..upper + 2 * side.width].split_at(side.width);
     for ((to, a), b) in blocked.iter_mut().zip(a).zip(b) {
@@ -346,7 +365,7 @@ fn sample_row_kernel<V: Lanes>(
             &blocked[pixel..pixel + width + 1],
         );
         for ((to, a), b) in values[..width].iter_mut().zip(blend).zip(&blend[1..]) {
-            *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + 8) / 16) as u8;
+            *to = ((u16::from(*a) * (16 - weight) + u16::from(*b) * weight + up) / 16) as u8;
         }
         for ((to, a), b) in blockers[..width].iter_mut().zip(blocked).zip(&blocked[1..]) {
             *to = if weight == 0 { *a } else { *a.max(b) };
@@ -363,7 +382,7 @@ fn sample_row_kernel<V: Lanes>(
         let at = pixel.clamp(0, last) as usize;
         let weight = ((position >> 12) & 15) as u16;
         let (a, b) = (u16::from(blend[at]), u16::from(blend[at + 1]));
-        *value = ((a * (16 - weight) + b * weight + 8) / 16) as u8;
+        *value = ((a * (16 - weight) + b * weight + up) / 16) as u8;
         *blocker = if pixel == at as i64 {
             blocked[at].max(blocked[at + 1])
         } else {

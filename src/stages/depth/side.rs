@@ -282,6 +282,36 @@ impl Side {
         (x1 - x0).hypot(y1 - y0) / (range.labels - 1) as f64
     }
 
+    /// Luminance of middle pixels, one a belief, and of the side where it sees the same, as turned.
+    pub fn counterparts(
+        &self,
+        range: &InverseDepthRange,
+        beliefs: &[Belief],
+        middle_y: &[u8],
+        middle: &Intrinsics,
+        scale: usize,
+    ) -> (Vec<u8>, Vec<u8>) {
+        let placings = self.placings(range);
+        let rows = beliefs.chunks_exact(middle.width.div_ceil(scale));
+        let mut pairs = (Vec::new(), Vec::new());
+        for (y, row) in rows
+            .enumerate()
+            .map(|(row, beliefs)| (row * scale, beliefs))
+        {
+            for (x, belief) in (0..middle.width).step_by(scale).zip(row) {
+                let placing = placings[usize::from(belief.label)];
+                if let Some(row) = self.place_row(placing, y)
+                    && let Some(at) = self.place(row, placing, x)
+                    && self.outside[at] != OUTSIDE
+                {
+                    pairs.0.push(middle_y[y * middle.width + x]);
+                    pairs.1.push(self.luminance[at]);
+                }
+            }
+        }
+        pairs
+    }
+
     /// Lets the middle's pixels block the view of what is behind them. One belief stands for `scale * scale` pixels.
     pub fn block(
         &mut self,

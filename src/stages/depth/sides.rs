@@ -1,12 +1,12 @@
 //! Depth of frames of several rigs, in buffers that are kept.
-//! In: luminance of the middle camera, what its sides saw. Out: as [`DepthEstimator`].
+//! In: the middle image, what its sides saw. Out: as [`DepthEstimator`].
 
 use super::{DepthEstimator, DepthMap, DepthRig, DepthSettings, InverseDepthRange, SideCamera};
 use crate::{
     isa::Isa,
     model::{
         camera::Intrinsics,
-        frame::{GreyImage, SideView, Sides},
+        frame::{RgbImage, SideView, Sides},
     },
 };
 
@@ -35,7 +35,7 @@ impl SidesDepth {
     pub fn compute(
         &mut self,
         middle: &Intrinsics,
-        image: &GreyImage,
+        image: &RgbImage,
         sides: &Sides,
         expected_depth_m: Option<&[f32]>,
     ) -> &DepthMap {
@@ -62,7 +62,7 @@ impl SidesDepth {
         let (rig, estimator) = self.estimators.last_mut().expect("one was pushed just now");
         estimator.estimate(
             rig,
-            &image.data,
+            image.data.as_chunks().0,
             &sides.left.image.data,
             &sides.right.image.data,
             &self.range,

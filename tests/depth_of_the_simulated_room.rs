@@ -1,0 +1,26 @@
+//! Three cameras see the depth of the simulated room: of all but glass, at least 95 % of the pixels within one label, on
+//! a seed that no setting was chosen on.
+
+use surprised::{
+    config::Settings, evaluation::simulated_depth::evaluate, pipeline::depth_range,
+    simulation::script::Script,
+};
+
+#[test]
+fn nineteen_of_twenty_pixels_of_the_simulated_room_are_within_one_label() {
+    let frames: Vec<u64> = (40..1300).step_by(160).collect();
+    let within = evaluate(
+        &Script::tabletop(4),
+        &frames,
+        depth_range(&Settings::robust()),
+    );
+    println!("{within:#.2?}");
+    assert!(
+        within.within_one_label.is_some_and(|share| share >= 95.0),
+        "{within:?}"
+    );
+    assert!(
+        within.cloth.is_some_and(|share| share >= 99.0),
+        "{within:?}"
+    );
+}
