@@ -1,6 +1,6 @@
 //! How long one thread takes to render what the three cameras see, 320x240 each: `cargo bench --bench render`.
 //!
-//! On a Xeon with AVX-512 and little else to do: 82 ms with the table laid, 92 ms with a person reaching in, 31 ms for the
+//! On a quiet Xeon with AVX-512: 81 ms with the table laid, 88 ms with a person reaching in, 30 ms for the
 //! middle camera alone.
 
 use criterion::{Criterion, criterion_group, criterion_main};
