@@ -1,4 +1,4 @@
-// Twin of src/stages/refine.rs: what is expected and what was observed at one resolution, how a point is seen by an
+// Twin of src/stages/refine/mod.rs: what is expected and what was observed at one resolution, how a point is seen by an
 // estimate, and the solution of the normal equations.
 
 const REFINE_VIEWS: u32 = 3u;
