@@ -158,9 +158,9 @@ impl Engines {
 }
 
 impl Engine {
-    /// Compares an image with what its views expect. `refined` is called between refining the pose and comparing, unless both
-    /// are done at once. `score` has the gain then, the surprise map wherever the evidence
-    /// seeds a region, and the posterior if it is learnt; the rest when [`Compared::maps_read`] says so.
+    /// Compares an image with what its views expect, from the refined pose where the question states a noise. `refined` is
+    /// called between the two, unless both are done at once. `score` has the gain then, the surprise map wherever the
+    /// evidence seeds a region, and the posterior if it is learnt; the rest when [`Compared::maps_read`] says so.
     ///
     /// # Errors
     /// The device was lost, cannot be replaced, and nothing else was allowed.
