@@ -669,6 +669,8 @@ impl Desk {
                     left,
                     "forgotten as asked"
                 );
+                // Whoever was answered finds it in the status.
+                self.publish_status();
                 drop(answer.send(Ok(reply)));
             }
             Ask::Mode {
@@ -677,6 +679,7 @@ impl Desk {
                 answer,
             } => {
                 let set = set.map_or(Ok(()), |mode| self.set_mode(camera.as_ref(), mode));
+                self.publish_status();
                 drop(answer.send(set.map(|()| match &camera {
                     Some(camera) => self.mode(camera),
                     None => self.mode_of_place(),
