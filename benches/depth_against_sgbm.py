@@ -4,14 +4,13 @@
     target/venv/bin/python benches/depth_against_sgbm.py ../shared/data/tsukuba
 
 Prints the time of the processor for one thread and of the clock for two, best and median of the repetitions in turns.
-A Xeon with AVX-512, two cores; milliseconds, and their share of SGBM's; 64 labels. One thread: of the processor, the median.
-Two threads: of the clock, the best of 40, as others used both cores meanwhile.
+A Xeon with AVX-512, two cores, nothing else at work; best of 40, milliseconds, and their share of SGBM's; 64 labels.
 
     size     threads  SGBM-HH, 2 cameras  ours, 3 cameras  ours, 2 cameras
-    320x240  1         13.8               14.8 (1.07)      13.1 (0.95)
-    320x240  2         19.6               18.7 (0.95)      15.4 (0.78)
-    640x480  1        106.0               51.6 (0.49)      47.5 (0.45)
-    640x480  2        194.9              111.7 (0.57)      96.2 (0.49)
+    320x240  1         13.7               14.2 (1.03)      13.3 (0.97)
+    320x240  2         13.6               10.0 (0.73)       8.9 (0.66)
+    640x480  1         77.5               50.8 (0.66)      45.2 (0.58)
+    640x480  2         76.6               33.5 (0.44)      28.3 (0.37)
 """
 
 import pathlib

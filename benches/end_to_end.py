@@ -7,6 +7,10 @@ Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second e
 with noise, a pose. First one robot: time from putting a frame to its report, beside the same bytes sent there and back
 by a process that does nothing else. Then more and more robots, in as many places as there are cores, each time on a
 fresh service, until a frame has no report. Robots and service share the machine.
+
+A Xeon of 2.6 GHz, two cores, nothing else at work, frames of 171 KiB: the echo takes 0.9 ms (99th percentile 8 ms). `robust`: one
+robot's report comes after 14.3 ms (19.4), of sixteen robots after 9.5 ms (41), twenty are too many. `paper`: 13.1 ms (16.3), of
+twenty robots 6.9 ms (51), twenty-four are too many.
 """
 
 import argparse

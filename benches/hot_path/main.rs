@@ -2,23 +2,23 @@
 //!
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
 //! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a Xeon
-//! with AVX-512 (2.6 GHz) and beside other work, least of 24 to 60 repetitions, milliseconds in time of the processor:
+//! with AVX-512 (2.6 GHz), two cores and nothing else at work, least of 16 repetitions, milliseconds:
 //!
 //! ```text
-//!                        320x240   noisy  3 views  15 views | 640x480   noisy  3 views  15 views
-//! paper, 7 views             6.8     8.6      4.1      13.5 |    27.1       -     15.4      55.6
-//! robust, one view more     11.5    13.1      7.9      19.5 |    42.3       -     30.0      77.3
-//! reference (of paper)       154     154        -         - |     626     626        -         -
-//! reading (of paper)         2.1     2.0      0.8       3.8 |     5.6     5.4      2.3      11.3
+//!                        320x240   noisy  3 views  15 views  2 threads | 640x480   noisy  3 views  15 views  2 threads
+//! paper, 7 views             7.2     8.4      4.0      13.4       4.5  |    26.0    33.4     15.2      54.1      15.5
+//! robust, one view more     10.9    12.3      7.3      18.9       8.4  |    40.2    49.5     27.9      76.8      29.5
+//! reference (of paper)       137     133        -         -         -  |     553     553        -         -         -
+//! reading (of paper)         2.2     2.2      0.9       4.3         -  |     5.8     5.3      2.2      12.5         -
 //! ```
 //!
-//! Of the 6.8: recall 5.0, score 0.9, prepare 0.2, observe 0.1; of the 11.5: refine 1.7, recall 7.1, score 2.2, prepare
-//! 0.4. Drawing the meshes and gathering the records are 2 ms of recall each, merging 1; it takes 0.80, 0.72 and 0.76 ms a
-//! view with 3, 7 and 15 views. On two threads, rarely undisturbed, by the clock: `paper` 3.2 where one took 5.4, `robust`
-//! 6.8 where one took 10.7; at 640x480 14.8 of 26.2 and 27.4 of 44.0. `peers.py`, least of 60, with
-//! refinement by one thread still: at 320x240 `paper` 7.3, `robust` 12.9, remap of 70 planes 13.2, interleaved 5.1, MOG2
-//! 2.3, KNN 4.7, NumPy + SciPy 12.4; at 640x480 27.2, 50.0, 49.5, 17.9, 9.8, 20.7, 58.6. Seven of 1,000,000 viewpoints are
-//! selected in 0.006 ms.
+//! Of the 7.2: recall 5.2, score 0.8, prepare 0.2, observe 0.1; of the 10.9: refine 1.7, recall 6.6, score 2.0, prepare
+//! 0.4. Drawing the meshes and gathering the records are 2 ms of recall each, merging 1; it takes 0.77, 0.75 and 0.69 ms a
+//! view with 3, 7 and 15 views. Of two threads that is the best; by the median they gain little here, because the second
+//! core is seldom free for a whole frame: 7.6 of 7.6 and 11.9 of 11.6 at 320x240, 21.5 of 28.2 and 35.6 of 43.5 at
+//! 640x480. `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
+//! interleaved 4.9, MOG2 2.6, KNN 4.6, NumPy + SciPy 11.4; at 640x480 26.0, 41.3, 47.8, 16.4, 9.1, 18.9, 55.3. Seven of
+//! 1,000,000 viewpoints are selected in 0.006 ms.
 //!
 //! How exact it is, as `tests/merge.rs`, `belief.rs` and `storage.rs` print it: from seven views of a smooth scene tau is
 //! 0.0007 grey levels (`robust` 0.001) off the plain mesh's, and 99.98 % of the pixels are seen by as many views; where views
