@@ -9,7 +9,7 @@ use object_store::Error;
 
 use super::{
     form::{FormError, checksum},
-    place::{Role, Shared},
+    shared::{Role, Shared},
     shelf::Result,
 };
 use crate::memory::Version;

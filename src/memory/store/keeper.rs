@@ -16,7 +16,7 @@ use super::{
     lease::{Lease, Looked, RENEW_EVERY, Watcher},
     loader::{self, note_unreadable},
     modes,
-    place::{Known, NAMES_MAX, News, Role, Shared},
+    shared::{Known, NAMES_MAX, News, Role, Shared},
     shelf::{Listed, Result},
     writer,
 };

@@ -38,6 +38,8 @@ mod place;
 
 pub mod planes;
 
+mod shared;
+
 mod shelf;
 
 mod way;
@@ -53,8 +55,11 @@ use object_store::{
 };
 use url::Url;
 
-pub use self::place::{Brought, PlaceOptions, PlaceStore, ROLES, Role, StoreStatus};
 use self::shelf::Shelf;
+pub use self::{
+    place::{Brought, PlaceStore},
+    shared::{PlaceOptions, ROLES, Role, StoreStatus},
+};
 
 /// The longest pause between two tries to reach the store.
 pub const RETRY_MAX: Duration = Duration::from_secs(8);

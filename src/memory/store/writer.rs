@@ -11,7 +11,7 @@ use super::{
     Backoff, events,
     form::{self, Label},
     modes,
-    place::{Known, News, Pending, Role, Shared},
+    shared::{Known, News, Pending, Role, Shared},
     shelf,
 };
 use crate::{memory::Version, model::mode::Modes};
