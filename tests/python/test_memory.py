@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import scene
 from daemon import BINARY, Daemon, Robot, ask, await_condition, open_session, remembered
+from surprised_proto import encoding
 
 KILLS = 6
 # The promise is the last two seconds; nothing is learnt here for longer before it is looked for.
@@ -172,6 +173,78 @@ def test_kills_at_random_instants_lose_no_more_than_the_last_two_seconds(service
             assert stored(again, "lab")["damaged"] == 0
             updates_before = updates
         again.stop()
+
+
+def put_without_calibration(robot: Robot):
+    message = robot.next_frame()
+    message.ClearField("calibration")
+    robot.put(message)
+    return message
+
+
+def calibrations_stored(url: str, place: str) -> set[str]:
+    kept = Path(urllib.parse.urlparse(url).path) / place / "calibrations"
+    return {path.name for path in kept.glob("*[0-9a-f]")}
+
+
+def test_a_calibration_that_was_put_once_is_known_after_a_kill_until_another_is_put(services, url):
+    lens = scene.frame(0, 0).calibration
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        session.put(f"{robot.key}/calibration", lens.SerializeToString(), encoding=encoding(lens))
+        robot.expect_report(put_without_calibration(robot))
+        (kept,) = await_condition("it is stored", lambda: calibrations_stored(url, "lab"))
+        first.stop(signal.SIGKILL)
+
+    second = services(url)
+    with open_session(second.endpoint) as session:
+        after = Robot(session, "lab")
+        after.sequence, after.stamp_ns = robot.sequence, robot.stamp_ns
+        after.expect_report(put_without_calibration(after))
+        # Of nobody else.
+        bert = Robot(session, "lab", "bert")
+        put_without_calibration(bert)
+        assert bert.expect_rejection().code == "no_calibration"
+        # Of another resolution: frames of the one before are of the wrong size from now on.
+        lens.middle.width, lens.middle.height = scene.WIDTH // 2, scene.HEIGHT // 2
+        lens.middle.cx, lens.middle.cy = scene.WIDTH / 4, scene.HEIGHT / 4
+        session.put(f"{robot.key}/calibration", lens.SerializeToString(), encoding=encoding(lens))
+        put_without_calibration(after)
+        assert after.expect_rejection().code == "image_size"
+        await_condition("the other is stored", lambda: calibrations_stored(url, "lab").isdisjoint({kept}))
+        second.stop(signal.SIGKILL)
+
+    third = services(url)
+    with open_session(third.endpoint) as session:
+        last = Robot(session, "lab")
+        last.sequence, last.stamp_ns = after.sequence, after.stamp_ns
+        put_without_calibration(last)
+        assert last.expect_rejection().code == "image_size"
+
+
+def test_a_robot_that_answers_with_another_calibration_than_the_stored_one_is_believed(services, url):
+    lens = scene.frame(0, 0).calibration
+    small = scene.frame(0, 0).calibration
+    small.middle.width, small.middle.height = scene.WIDTH // 2, scene.HEIGHT // 2
+    small.middle.cx, small.middle.cy = scene.WIDTH / 4, scene.HEIGHT / 4
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        session.put(f"{robot.key}/calibration", small.SerializeToString(), encoding=encoding(small))
+        put_without_calibration(robot)
+        assert robot.expect_rejection().code == "image_size"
+        await_condition("it is stored", lambda: calibrations_stored(url, "lab"))
+        first.stop(signal.SIGKILL)
+    second = services(url)
+    with open_session(second.endpoint) as session:
+        after = Robot(session, "lab")
+        after.sequence, after.stamp_ns = robot.sequence, robot.stamp_ns
+        key = f"{after.key}/calibration"
+        answer = lambda query: query.reply(key, lens.SerializeToString(), encoding=encoding(lens))  # noqa: E731
+        with session.declare_queryable(key, answer):
+            await_condition("it is read", lambda: stored(second, "lab").get("role") in ("reader", "writer", None))
+            after.expect_report(put_without_calibration(after))
 
 
 def test_a_frozen_camera_is_still_frozen_after_a_kill(services, url):

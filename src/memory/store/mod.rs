@@ -14,6 +14,7 @@
 //! | pending changes | one a viewpoint; they keep in RAM what the memory's own budget counts | the newest state wins; what is not stored cannot leave RAM, and when that fills the budget the nearest viewpoint is replaced, as without a store |
 //! | modes to be written | one, of the place | the newest wins |
 //! | events to be written | one an event that the service tells of | the newest state wins |
+//! | calibrations to be written | one a camera, of as many as the worker knows | the newest wins |
 //! | wanted and loaded | [`loader::LOADS_MAX`], and a quarter of the memory's budget | what is only expected to be needed is dropped and counted |
 //!
 //! A change is written half of `write_behind_s` after it came, so that the other half is left for the writing. What took
@@ -21,8 +22,6 @@
 //! service goes on in RAM, tries again ever less often, up to every [`RETRY_MAX`], and says so.
 
 pub mod archive;
-
-mod events;
 
 pub mod form;
 
@@ -33,6 +32,8 @@ mod lease;
 mod loader;
 
 mod modes;
+
+mod notes;
 
 mod place;
 

@@ -11,7 +11,7 @@ use bytes::Bytes;
 use tokio::runtime::Handle;
 
 use super::{
-    Store, keeper,
+    Store, form, keeper,
     loader::{self, LOADS_MAX},
     shared::{NAMES_MAX, News, Pending, PlaceOptions, ROLES, Role, Shared, State, StoreStatus},
     way::{self, Passed},
@@ -131,9 +131,25 @@ impl PlaceStore {
     pub fn keep_event(&self, id: u64, content: Option<Vec<u8>>) {
         let mut state = self.shared.lock();
         if state.role == Role::Writer {
-            state.events.keep(id, content.map(Bytes::from));
+            let by = Instant::now() + self.shared.options.write_behind_half();
+            state.events.keep(id, content.map(Bytes::from), by);
             self.shared.for_writer.notify_one();
         }
+    }
+
+    /// Keeps a camera's calibration, whose id it has: soon where this service writes the place, else when it does.
+    pub fn keep_calibration(&self, source: &Source, content: Vec<u8>) {
+        let id = form::checksum(format!("{}/{}", source.robot, source.camera).as_bytes());
+        let mut state = self.shared.lock();
+        let content = Some(Bytes::from(content));
+        state.calibrations.keep(id, content, Instant::now());
+        self.shared.for_writer.notify_one();
+    }
+
+    /// Stored calibrations that were not taken yet.
+    pub fn take_calibrations(&self) -> Vec<Bytes> {
+        let read = std::mem::take(&mut self.shared.lock().calibrations.read);
+        read.into_iter().map(|(_, content)| content).collect()
     }
 
     /// Stored events that were not taken yet.

@@ -9,7 +9,11 @@ use std::{
 use serde::Serialize;
 use tokio::sync::Notify;
 
-use super::{events::EventNotes, form, lease, shelf::Shelf};
+use super::{
+    form, lease,
+    notes::{Kind, Notes},
+    shelf::Shelf,
+};
 use crate::{
     config::Settings,
     memory::Version,
@@ -48,6 +52,11 @@ impl PlaceOptions {
             views: settings.views,
             metres_per_radian: settings.metres_per_radian,
         }
+    }
+
+    /// How long after a change it is written: the other half of the time is left for the writing.
+    pub fn write_behind_half(&self) -> Duration {
+        self.write_behind / 2
     }
 }
 
@@ -177,7 +186,8 @@ pub struct State {
     pub modes_said: Modes,
     /// The worker knows what these come to.
     pub modes_told: bool,
-    pub events: EventNotes,
+    pub events: Notes,
+    pub calibrations: Notes,
     /// To be loaded, the next first.
     pub wanted: VecDeque<u64>,
     /// Being loaded.
@@ -201,10 +211,22 @@ impl State {
         self.fetching.contains(&id) || self.wanted.contains(&id)
     }
 
+    pub fn notes(&mut self, kind: Kind) -> &mut Notes {
+        match kind {
+            Kind::Event => &mut self.events,
+            Kind::Calibration => &mut self.calibrations,
+        }
+    }
+
     /// Changes that are not stored yet.
     pub fn unstored(&self) -> usize {
-        let modes = self.role == Role::Writer && !self.modes_said.is_empty();
-        self.pending.len() + self.writing + usize::from(modes) + self.events.unstored()
+        let mut unstored = self.pending.len() + self.writing + self.events.unstored();
+        // What else was said here waits until this service writes the place.
+        if self.role == Role::Writer {
+            let modes = usize::from(!self.modes_said.is_empty());
+            unstored += modes + self.calibrations.unstored();
+        }
+        unstored
     }
 
     /// Whether the lease of this epoch still allows to write.

@@ -31,8 +31,11 @@ impl Desk {
             let Worker { session, root, .. } = &self.worker;
             match CameraPublisher::new(session, root, &path) {
                 Ok(publisher) => {
-                    self.cameras
-                        .insert(source.clone(), Camera::new(path, publisher));
+                    let mut camera = Camera::new(path, publisher);
+                    if let Some(known) = self.calibrations.get(source) {
+                        camera.remember_calibration(known, self.limits);
+                    }
+                    self.cameras.insert(source.clone(), camera);
                 }
                 Err(error) => {
                     tracing::warn!("no publishers for {}: {error}", path.key(root, ""));
@@ -72,6 +75,9 @@ impl Desk {
             Aside::Mode(_) => (keys::MODE, set),
             Aside::Refused(leaf, refusal) => (leaf, Err(refusal)),
         };
+        if leaf == keys::CALIBRATION && result.is_ok() {
+            self.keep_calibration(source);
+        }
         if let Err(refusal) = result {
             self.refuse(
                 source,
@@ -213,6 +219,7 @@ impl Desk {
         if camera.watched(Instant::now()) {
             camera.show(|image, report| snapshot(pipeline, image, report));
         }
+        self.keep_calibration(source);
         self.tell(&report);
         Ok(())
     }

@@ -11,12 +11,14 @@ use crate::{
         pose::Pose,
         refusal::Refusal,
     },
-    service::inbox::CAMERAS_MAX,
-    wire::decode,
+    service::{camera::Camera, inbox::CAMERAS_MAX},
+    wire::{decode, encode},
 };
 
 /// Cameras whose modes are kept while the cameras themselves have made room for others.
 const MODES_MAX: usize = 1024;
+/// Cameras whose calibrations are kept, likewise.
+const CALIBRATIONS_MAX: usize = 1024;
 /// Viewpoints that a step of forgetting goes through: about the time of a frame, and more than all cameras can write
 /// between two steps, so that it comes to an end.
 const FORGET_STEP: usize = 2 * CAMERAS_MAX;
@@ -79,6 +81,7 @@ impl Desk {
             memory.sync(pipeline.memory_mut());
         }
         self.sync_events();
+        self.sync_calibrations();
     }
 
     /// Goes on with stored events, as after a restart.
@@ -108,6 +111,54 @@ impl Desk {
                     );
                 }
             }
+        }
+    }
+
+    /// Keeps what is known now of a camera's calibration, for when it comes back and for after a restart.
+    pub(super) fn keep_calibration(&mut self, source: &Source) {
+        let camera = self.cameras.get(source);
+        let Some(calibration) = camera.and_then(Camera::calibration) else {
+            return;
+        };
+        let kept = self.calibrations.get(source);
+        if kept == Some(calibration) {
+            return;
+        }
+        if kept.is_none() && self.calibrations.len() >= CALIBRATIONS_MAX {
+            tracing::debug!(
+                place = &*self.worker.place,
+                "the calibration of {}/{} is not kept: those of {CALIBRATIONS_MAX} cameras are",
+                source.robot,
+                source.camera
+            );
+            return;
+        }
+        if let Some(memory) = &self.worker.memory {
+            let content = encode::camera_calibration(source, calibration);
+            memory.keep_calibration(source, encode::bytes(&content));
+        }
+        self.calibrations
+            .insert(source.clone(), calibration.clone());
+    }
+
+    /// Goes on with stored calibrations, as after a restart. What came from the cameras since is newer.
+    fn sync_calibrations(&mut self) {
+        let memory = self.worker.memory.as_ref();
+        for content in memory.map_or_else(Vec::new, PlaceStore::take_calibrations) {
+            let (source, calibration) = match decode::camera_calibration(&content) {
+                Ok(stored) => stored,
+                Err(refusal) => {
+                    tracing::warn!(
+                        place = &*self.worker.place,
+                        "a stored calibration is not used: {refusal}"
+                    );
+                    continue;
+                }
+            };
+            if let Some(camera) = self.cameras.get_mut(&source) {
+                camera.remember_calibration(&calibration, self.limits);
+            }
+            self.calibrations.entry(source).or_insert(calibration);
         }
     }
 

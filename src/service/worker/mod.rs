@@ -30,7 +30,7 @@ use super::{
 };
 use crate::{
     memory::store::PlaceStore,
-    model::{frame::Source, mode::Modes, pose::PoseNoise},
+    model::{camera::RigCalibration, frame::Source, mode::Modes, pose::PoseNoise},
     pipeline::Pipeline,
     wire::{decode::Limits, keys::CameraPath},
 };
@@ -73,6 +73,8 @@ struct Desk {
     stopwatches: Stopwatches,
     /// What was said about modes; of a stored memory, what holds there.
     modes: Modes,
+    /// The last of each camera, also of cameras that made room for others or have not come again since the start.
+    calibrations: BTreeMap<Source, RigCalibration>,
     asks: AskCounters,
 }
 
@@ -101,6 +103,7 @@ impl Worker {
             refused_by: BTreeMap::new(),
             stopwatches: self.metrics.stopwatches(&self.place),
             modes: Modes::default(),
+            calibrations: BTreeMap::new(),
             asks: AskCounters::default(),
             worker: self,
         };
