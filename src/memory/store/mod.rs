@@ -191,7 +191,7 @@ impl Store {
         }
     }
 
-    /// Names of the places of which there are viewpoints.
+    /// Names of the places of which there are viewpoints or events.
     ///
     /// # Errors
     /// A store that cannot be reached.
@@ -209,14 +209,19 @@ impl Store {
         Ok(places)
     }
 
-    /// Whether there are viewpoints of a place.
+    /// Whether there are viewpoints or events of a place.
     ///
     /// # Errors
     /// A store that cannot be reached.
     pub async fn has(&self, place: &str) -> Result<bool, StoreError> {
-        let viewpoints = self.at.clone().join(place).join(shelf::VIEWPOINTS);
-        let first = self.objects.list(Some(&viewpoints)).next().await;
-        Ok(first.transpose()?.is_some())
+        for folder in [shelf::VIEWPOINTS, notes::Kind::Event.folder()] {
+            let folder = self.at.clone().join(place).join(folder);
+            let first = self.objects.list(Some(&folder)).next().await;
+            if first.transpose()?.is_some() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 
     fn shelf(&self, place: &str) -> Shelf {
