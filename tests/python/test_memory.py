@@ -135,6 +135,44 @@ def test_events_go_on_after_a_kill(services, url):
     assert events(third) == [ended]
 
 
+def test_a_place_of_which_only_events_are_left_is_open_from_the_start_and_travels(services, url, tmp_path):
+    def events(daemon: Daemon, place: str) -> list[dict]:
+        code, _, body = daemon.fetch(f"/api/v1/places/{place}/events")
+        return json.loads(body)["events"] if code == 200 else []
+
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        for _ in range(8):
+            robot.show()
+        ask(session, "surprised/lab/@memory/mode?set=observe")
+        for _ in range(3):
+            robot.show(scene.BOX)
+    lasting = events(first, "lab")
+    assert lasting
+    pictures = [first.fetch(f"/api/v1/places/lab/events/{event['id']}/seen.jpg")[2] for event in lasting]
+    assert first.stop() == 0
+    lab = Path(urllib.parse.urlparse(url).path) / "lab"
+    shutil.rmtree(lab / "viewpoints")
+
+    second = services(url)
+    # Without being asked for.
+    await_condition("the place is open", lambda: "lab" in second.fetch_json("/api/v1/places")["places"])
+    await_condition("its events are known", lambda: events(second, "lab") == lasting)
+    assert second.stop() == 0
+
+    file = tmp_path / "lab.place"
+    other = (tmp_path / "other").as_uri()
+    for arguments in (["export", "lab", file, "--memory", url], ["import", "attic", file, "--memory", other]):
+        subprocess.run([BINARY, *arguments], check=True, capture_output=True, timeout=60)
+    third = services(other)
+    await_condition("its events are known", lambda: events(third, "attic"))
+    assert events(third, "attic") == [event | {"place": "attic"} for event in lasting]
+    for event, picture in zip(lasting, pictures, strict=True):
+        assert third.fetch(f"/api/v1/places/attic/events/{event['id']}/seen.jpg")[2] == picture
+    assert status(third, "attic")["mode"] == "observe"
+
+
 def test_a_clean_stop_loses_nothing(services, url):
     first = services(url, "--set", "write_behind_s=3600")
     learn(first, "lab", 5)

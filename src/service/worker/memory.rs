@@ -96,7 +96,9 @@ impl Desk {
         let Some(memory) = memory else { return };
         for (id, content) in memory.take_events() {
             match decode::event::stored(&content) {
-                Ok((message, event)) => {
+                Ok((mut message, event)) => {
+                    // It may have been another's that was imported under this name.
+                    message.place = place.to_string();
                     pipeline.resume_event(event);
                     let mut gone = None;
                     events.send_modify(|events| gone = Arc::make_mut(events).restore(message));
