@@ -219,6 +219,28 @@ fn what_was_forgotten_is_stored_and_read_back_bit_for_bit_and_its_size_is_known(
 }
 
 #[test]
+fn what_viewpoints_take_after_a_part_of_them_was_forgotten_is_what_the_memory_says() {
+    let mut pipeline = learnt_with(true);
+    let taken = |pipeline: &Pipeline| -> usize {
+        let viewpoints = pipeline.memory().viewpoints().iter();
+        viewpoints.map(|viewpoint| viewpoint.bytes()).sum()
+    };
+    assert_eq!(pipeline.memory().bytes(), taken(&pipeline));
+    let bytes = taken(&pipeline);
+    // Held elsewhere, as while they are stored, each is copied before it is changed, and the copy takes no more than it
+    // needs.
+    let held = pipeline.memory().viewpoints().to_vec();
+    forget(&mut pipeline, in_region(HOLE));
+    assert_ne!(
+        taken(&pipeline),
+        bytes,
+        "some take more or less than before"
+    );
+    assert_eq!(pipeline.memory().bytes(), taken(&pipeline));
+    drop(held);
+}
+
+#[test]
 fn a_box_around_everything_leaves_no_viewpoint() {
     let mut pipeline = learnt();
     let views = pipeline.memory().viewpoints().len();

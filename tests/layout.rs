@@ -29,10 +29,7 @@ const OUTSIDERS: [(&str, &[&str]); 7] = [
     ("axum", &["service/http/"]),
     ("prost", &["wire/"]),
     ("wgpu", &["engine/gpu"]),
-    (
-        "prometheus_client",
-        &["service/metrics.rs", "service/http/"],
-    ),
+    ("prometheus_client", &["service/metrics", "service/http/"]),
     ("utoipa", &["service/"]),
     ("object_store", &["memory/store/"]),
 ];

@@ -49,9 +49,10 @@ impl PlaceAndFile {
 
     fn print(&self, done: &str, archived: Archived) {
         println!(
-            "{}: {} viewpoints, {:.1} MB {done} {}",
+            "{}: {} viewpoints and {} events, {:.1} MB {done} {}",
             self.place,
             archived.viewpoints,
+            archived.events,
             archived.bytes as f64 / 1e6,
             self.file.display()
         );

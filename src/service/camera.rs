@@ -55,6 +55,8 @@ pub struct Camera {
     pub track: PoseTrack,
     pub waiting: Option<Waiting>,
     calibration: Option<Arc<Lenses>>,
+    /// From before a restart: for a robot that does not answer when it is asked, as it may have been changed since.
+    remembered: Option<Arc<Lenses>>,
     /// Markers whose plate is not known yet: stamps and positions in the world.
     markers: VecDeque<(i64, MarkersInWorld)>,
     calibration_asked: Option<Instant>,
@@ -156,6 +158,7 @@ impl Camera {
             track: PoseTrack::default(),
             waiting: None,
             calibration: None,
+            remembered: None,
             markers: VecDeque::new(),
             calibration_asked: None,
             order: StampOrder::default(),
@@ -177,6 +180,19 @@ impl Camera {
     ) -> Result<(), Refusal> {
         self.calibration = Some(self.lenses(Some(&calibration), limits)?);
         Ok(())
+    }
+
+    /// To be used if none comes when the robot is asked for it.
+    pub fn remember_calibration(&mut self, calibration: &RigCalibration, limits: Limits) {
+        match Lenses::new(calibration.clone(), limits) {
+            Ok(lenses) => self.remembered = Some(Arc::new(lenses)),
+            Err(refusal) => tracing::warn!("a stored calibration is not used: {refusal}"),
+        }
+    }
+
+    /// The last that came, or is used for want of one.
+    pub fn calibration(&self) -> Option<&RigCalibration> {
+        Some(&self.calibration.as_ref()?.calibration)
     }
 
     /// Of the calibration that a frame brings, or else of the one that is known.
@@ -210,7 +226,7 @@ impl Camera {
         let brought = self.waiting.as_ref();
         brought
             .and_then(|waiting| waiting.frame.calibration.as_ref())
-            .or_else(|| Some(&self.calibration.as_ref()?.calibration))
+            .or_else(|| self.calibration())
     }
 
     /// Takes a sample of the `markers` key; [`Self::fit_markers`] makes a pose of it.
@@ -297,6 +313,11 @@ impl Camera {
         pose_wait: Duration,
         ask_calibration: impl FnOnce(&CameraPath),
     ) -> Option<Turn> {
+        self.waiting.as_ref()?;
+        let has_waited = |asked| now.saturating_duration_since(asked) >= CALIBRATION_WAIT;
+        if self.calibration_at_hand().is_none() && self.calibration_asked.is_some_and(has_waited) {
+            self.calibration = self.remembered.take();
+        }
         let Waiting { frame, arrived } = self.waiting.as_ref()?;
         let refuse = |refusal| {
             Turn::Refused(Refused {
@@ -307,14 +328,17 @@ impl Camera {
         };
         let turn = match self.calibration_at_hand() {
             None => {
-                if self
-                    .calibration_asked
-                    .is_none_or(|asked| now.saturating_duration_since(asked) >= CALIBRATION_WAIT)
-                {
+                let asked = self.calibration_asked.filter(|asked| !has_waited(*asked));
+                if asked.is_none() {
                     ask_calibration(&self.path);
                     self.calibration_asked = Some(now);
                 }
-                let deadline = *arrived + CALIBRATION_WAIT;
+                // What is remembered helps this frame only if nothing else comes.
+                let since = match self.remembered {
+                    Some(_) => asked.unwrap_or(now),
+                    None => *arrived,
+                };
+                let deadline = since + CALIBRATION_WAIT;
                 if now < deadline {
                     return Some(Turn::Until(deadline));
                 }

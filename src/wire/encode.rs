@@ -13,7 +13,7 @@ use crate::{
     model::{
         camera::{Calibration, Intrinsics, RigCalibration, SideCalibrations},
         event::{EndReason, Event, Kind, Picture, Sighting, State},
-        frame::{DepthSource, Frame, GreyImage, RgbImage, RigFrame},
+        frame::{DepthSource, Frame, GreyImage, RgbImage, RigFrame, Source},
         mode::Mode,
         pose::Pose,
         refusal::Refusal,
@@ -131,6 +131,15 @@ pub fn rig_calibration(rig: &RigCalibration) -> proto::Calibration {
         message.camera_from_plate = Some(pose(&plate.camera_from_plate));
     }
     message
+}
+
+/// As it is kept with the place.
+pub fn camera_calibration(source: &Source, rig: &RigCalibration) -> proto::CameraCalibration {
+    proto::CameraCalibration {
+        robot: source.robot.to_string(),
+        camera: source.camera.to_string(),
+        calibration: Some(rig_calibration(rig)),
+    }
 }
 
 fn lens(calibration: &Calibration) -> proto::Intrinsics {

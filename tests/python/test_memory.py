@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 import scene
 from daemon import BINARY, Daemon, Robot, ask, await_condition, open_session, remembered
+from surprised_proto import encoding
 
 KILLS = 6
 # The promise is the last two seconds; nothing is learnt here for longer before it is looked for.
@@ -134,6 +135,44 @@ def test_events_go_on_after_a_kill(services, url):
     assert events(third) == [ended]
 
 
+def test_a_place_of_which_only_events_are_left_is_open_from_the_start_and_travels(services, url, tmp_path):
+    def events(daemon: Daemon, place: str) -> list[dict]:
+        code, _, body = daemon.fetch(f"/api/v1/places/{place}/events")
+        return json.loads(body)["events"] if code == 200 else []
+
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        for _ in range(8):
+            robot.show()
+        ask(session, "surprised/lab/@memory/mode?set=observe")
+        for _ in range(3):
+            robot.show(scene.BOX)
+    lasting = events(first, "lab")
+    assert lasting
+    pictures = [first.fetch(f"/api/v1/places/lab/events/{event['id']}/seen.jpg")[2] for event in lasting]
+    assert first.stop() == 0
+    lab = Path(urllib.parse.urlparse(url).path) / "lab"
+    shutil.rmtree(lab / "viewpoints")
+
+    second = services(url)
+    # Without being asked for.
+    await_condition("the place is open", lambda: "lab" in second.fetch_json("/api/v1/places")["places"])
+    await_condition("its events are known", lambda: events(second, "lab") == lasting)
+    assert second.stop() == 0
+
+    file = tmp_path / "lab.place"
+    other = (tmp_path / "other").as_uri()
+    for arguments in (["export", "lab", file, "--memory", url], ["import", "attic", file, "--memory", other]):
+        subprocess.run([BINARY, *arguments], check=True, capture_output=True, timeout=60)
+    third = services(other)
+    await_condition("its events are known", lambda: events(third, "attic"))
+    assert events(third, "attic") == [event | {"place": "attic"} for event in lasting]
+    for event, picture in zip(lasting, pictures, strict=True):
+        assert third.fetch(f"/api/v1/places/attic/events/{event['id']}/seen.jpg")[2] == picture
+    assert status(third, "attic")["mode"] == "observe"
+
+
 def test_a_clean_stop_loses_nothing(services, url):
     first = services(url, "--set", "write_behind_s=3600")
     learn(first, "lab", 5)
@@ -172,6 +211,78 @@ def test_kills_at_random_instants_lose_no_more_than_the_last_two_seconds(service
             assert stored(again, "lab")["damaged"] == 0
             updates_before = updates
         again.stop()
+
+
+def put_without_calibration(robot: Robot):
+    message = robot.next_frame()
+    message.ClearField("calibration")
+    robot.put(message)
+    return message
+
+
+def calibrations_stored(url: str, place: str) -> set[str]:
+    kept = Path(urllib.parse.urlparse(url).path) / place / "calibrations"
+    return {path.name for path in kept.glob("*[0-9a-f]")}
+
+
+def test_a_calibration_that_was_put_once_is_known_after_a_kill_until_another_is_put(services, url):
+    lens = scene.frame(0, 0).calibration
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        session.put(f"{robot.key}/calibration", lens.SerializeToString(), encoding=encoding(lens))
+        robot.expect_report(put_without_calibration(robot))
+        (kept,) = await_condition("it is stored", lambda: calibrations_stored(url, "lab"))
+        first.stop(signal.SIGKILL)
+
+    second = services(url)
+    with open_session(second.endpoint) as session:
+        after = Robot(session, "lab")
+        after.sequence, after.stamp_ns = robot.sequence, robot.stamp_ns
+        after.expect_report(put_without_calibration(after))
+        # Of nobody else.
+        bert = Robot(session, "lab", "bert")
+        put_without_calibration(bert)
+        assert bert.expect_rejection().code == "no_calibration"
+        # Of another resolution: frames of the one before are of the wrong size from now on.
+        lens.middle.width, lens.middle.height = scene.WIDTH // 2, scene.HEIGHT // 2
+        lens.middle.cx, lens.middle.cy = scene.WIDTH / 4, scene.HEIGHT / 4
+        session.put(f"{robot.key}/calibration", lens.SerializeToString(), encoding=encoding(lens))
+        put_without_calibration(after)
+        assert after.expect_rejection().code == "image_size"
+        await_condition("the other is stored", lambda: calibrations_stored(url, "lab").isdisjoint({kept}))
+        second.stop(signal.SIGKILL)
+
+    third = services(url)
+    with open_session(third.endpoint) as session:
+        last = Robot(session, "lab")
+        last.sequence, last.stamp_ns = after.sequence, after.stamp_ns
+        put_without_calibration(last)
+        assert last.expect_rejection().code == "image_size"
+
+
+def test_a_robot_that_answers_with_another_calibration_than_the_stored_one_is_believed(services, url):
+    lens = scene.frame(0, 0).calibration
+    small = scene.frame(0, 0).calibration
+    small.middle.width, small.middle.height = scene.WIDTH // 2, scene.HEIGHT // 2
+    small.middle.cx, small.middle.cy = scene.WIDTH / 4, scene.HEIGHT / 4
+    first = services(url)
+    with open_session(first.endpoint) as session:
+        robot = Robot(session, "lab")
+        session.put(f"{robot.key}/calibration", small.SerializeToString(), encoding=encoding(small))
+        put_without_calibration(robot)
+        assert robot.expect_rejection().code == "image_size"
+        await_condition("it is stored", lambda: calibrations_stored(url, "lab"))
+        first.stop(signal.SIGKILL)
+    second = services(url)
+    with open_session(second.endpoint) as session:
+        after = Robot(session, "lab")
+        after.sequence, after.stamp_ns = robot.sequence, robot.stamp_ns
+        key = f"{after.key}/calibration"
+        answer = lambda query: query.reply(key, lens.SerializeToString(), encoding=encoding(lens))  # noqa: E731
+        with session.declare_queryable(key, answer):
+            await_condition("it is read", lambda: stored(second, "lab").get("role") in ("reader", "writer", None))
+            after.expect_report(put_without_calibration(after))
 
 
 def test_a_frozen_camera_is_still_frozen_after_a_kill(services, url):

@@ -11,12 +11,12 @@ use object_store::Error;
 
 use super::{
     Backoff,
-    events::{self, EventNotes},
     form::{self, FormError},
     lease::{Lease, Looked, RENEW_EVERY, Watcher},
     loader::{self, note_unreadable},
     modes,
-    place::{Known, NAMES_MAX, News, Role, Shared},
+    notes::{self, Kind, Notes},
+    shared::{Known, NAMES_MAX, News, Role, Shared},
     shelf::{Listed, Result},
     writer,
 };
@@ -116,7 +116,8 @@ fn lost(shared: &Shared) {
     state.modes_said = Modes::default();
     state.modes_version = None;
     state.modes_told = false;
-    state.events = EventNotes::default();
+    state.events = Notes::default();
+    state.calibrations = Notes::default();
     state.counters.lost += count;
     state.role = Role::Reader {
         holder: "another service".to_owned(),
@@ -212,11 +213,12 @@ async fn tidy(shared: &Shared, lease: &Lease) -> Result<()> {
     for stranger in &read.strangers {
         shared.shelf.move_aside(stranger).await?;
     }
-    let events_damaged = events::tidy(shared, read.events).await?;
-    let found = read.strangers.len()
-        + read.modes_damaged.len()
-        + events_damaged
-        + set_aside(shared).await?;
+    let mut notes_damaged = 0;
+    for useless in read.notes {
+        notes_damaged += notes::tidy(shared, useless).await?;
+    }
+    let found =
+        read.strangers.len() + read.modes_damaged.len() + notes_damaged + set_aside(shared).await?;
     // Also what was set aside in earlier times.
     let (names, count) = shared.shelf.damaged(NAMES_MAX).await?;
     let mut state = shared.lock();
@@ -279,7 +281,7 @@ struct Read {
     strangers: Vec<object_store::path::Path>,
     modes_superseded: Vec<Version>,
     modes_damaged: Vec<Version>,
-    events: events::Useless,
+    notes: Vec<notes::Useless>,
 }
 
 /// Learns what is stored of the modes: the newest state that can be read.
@@ -334,7 +336,9 @@ async fn refresh(shared: &Shared) -> Result<Read> {
         ..Read::default()
     };
     refresh_modes(shared, &mut read).await?;
-    read.events = events::refresh(shared).await?;
+    for kind in Kind::ALL {
+        read.notes.push(notes::refresh(shared, kind).await?);
+    }
     let known: BTreeMap<u64, Version> = {
         let state = shared.lock();
         let catalogue = state.catalogue.iter();

@@ -9,8 +9,8 @@ use tokio::task::{JoinSet, spawn_blocking};
 use super::{
     Backoff,
     form::{self, FormError},
-    place::{News, Shared, Unreadable},
     planes,
+    shared::{News, Shared, Unreadable},
 };
 use crate::memory::Version;
 

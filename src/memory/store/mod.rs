@@ -14,6 +14,7 @@
 //! | pending changes | one a viewpoint; they keep in RAM what the memory's own budget counts | the newest state wins; what is not stored cannot leave RAM, and when that fills the budget the nearest viewpoint is replaced, as without a store |
 //! | modes to be written | one, of the place | the newest wins |
 //! | events to be written | one an event that the service tells of | the newest state wins |
+//! | calibrations to be written | one a camera, of as many as the worker knows | the newest wins |
 //! | wanted and loaded | [`loader::LOADS_MAX`], and a quarter of the memory's budget | what is only expected to be needed is dropped and counted |
 //!
 //! A change is written half of `write_behind_s` after it came, so that the other half is left for the writing. What took
@@ -21,8 +22,6 @@
 //! service goes on in RAM, tries again ever less often, up to every [`RETRY_MAX`], and says so.
 
 pub mod archive;
-
-mod events;
 
 pub mod form;
 
@@ -34,9 +33,13 @@ mod loader;
 
 mod modes;
 
+mod notes;
+
 mod place;
 
 pub mod planes;
+
+mod shared;
 
 mod shelf;
 
@@ -53,8 +56,11 @@ use object_store::{
 };
 use url::Url;
 
-pub use self::place::{Brought, PlaceOptions, PlaceStore, ROLES, Role, StoreStatus};
 use self::shelf::Shelf;
+pub use self::{
+    place::{Brought, PlaceStore},
+    shared::{PlaceOptions, ROLES, Role, StoreStatus},
+};
 
 /// The longest pause between two tries to reach the store.
 pub const RETRY_MAX: Duration = Duration::from_secs(8);
@@ -185,7 +191,7 @@ impl Store {
         }
     }
 
-    /// Names of the places of which there are viewpoints.
+    /// Names of the places of which there are viewpoints or events.
     ///
     /// # Errors
     /// A store that cannot be reached.
@@ -203,14 +209,19 @@ impl Store {
         Ok(places)
     }
 
-    /// Whether there are viewpoints of a place.
+    /// Whether there are viewpoints or events of a place.
     ///
     /// # Errors
     /// A store that cannot be reached.
     pub async fn has(&self, place: &str) -> Result<bool, StoreError> {
-        let viewpoints = self.at.clone().join(place).join(shelf::VIEWPOINTS);
-        let first = self.objects.list(Some(&viewpoints)).next().await;
-        Ok(first.transpose()?.is_some())
+        for folder in [shelf::VIEWPOINTS, notes::Kind::Event.folder()] {
+            let folder = self.at.clone().join(place).join(folder);
+            let first = self.objects.list(Some(&folder)).next().await;
+            if first.transpose()?.is_some() {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 
     fn shelf(&self, place: &str) -> Shelf {

@@ -1,34 +1,24 @@
 //! The stored memory of one place, as the place's worker sees it: hands over what changed, learns what is known, asks
-//! for what it needs. All that touches the store runs in tasks of its own; this is what they share.
+//! for what it needs. All that touches the store runs in tasks of its own; [`super::shared`] is what they share.
 
 use std::{
-    collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-    sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError},
+    collections::HashMap,
+    sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
 
 use bytes::Bytes;
-use serde::Serialize;
-use tokio::{runtime::Handle, sync::Notify};
+use tokio::runtime::Handle;
 
 use super::{
-    Store,
-    events::EventNotes,
-    form, keeper, lease,
+    Store, form, keeper,
     loader::{self, LOADS_MAX},
-    shelf::Shelf,
+    shared::{NAMES_MAX, News, Pending, PlaceOptions, ROLES, Role, Shared, State, StoreStatus},
     way::{self, Passed},
 };
 use crate::{
-    config::Settings,
-    memory::{Memory, Version, residency::Change},
-    model::{
-        frame::Source,
-        mode::Modes,
-        pose::Pose,
-        refusal::Refusal,
-        viewpoint::{Head, Viewpoint},
-    },
+    memory::{Memory, residency::Change},
+    model::{frame::Source, mode::Modes, pose::Pose, refusal::Refusal},
 };
 
 /// How far ahead of a robot viewpoints are loaded, and how many more than a frame recalls.
@@ -47,263 +37,6 @@ const WARM_AT_ONCE: usize = 16;
 const LOADS_SHARE: usize = 4;
 /// Robots whose way is followed.
 const WAYS_MAX: usize = 64;
-/// Damaged objects that are named; there may be more.
-pub const NAMES_MAX: usize = 16;
-
-/// What the place's settings say to its store.
-#[derive(Debug, Clone)]
-pub struct PlaceOptions {
-    /// A crash loses at most the last so much.
-    pub write_behind: Duration,
-    /// Budget of what is in RAM, bytes.
-    pub memory_bytes: usize,
-    /// Larger images are not loaded.
-    pub pixels_max: usize,
-    /// Of what viewpoints are learnt with.
-    pub settings_hash: u64,
-    /// How many viewpoints a frame recalls.
-    pub views: usize,
-    pub metres_per_radian: f64,
-}
-
-impl PlaceOptions {
-    pub fn new(settings: &Settings) -> Self {
-        Self {
-            write_behind: Duration::from_secs_f64(settings.write_behind_s),
-            memory_bytes: settings.memory_bytes,
-            pixels_max: settings.image_pixels_max,
-            settings_hash: settings_hash(settings),
-            views: settings.views,
-            metres_per_radian: settings.metres_per_radian,
-        }
-    }
-}
-
-/// Of the settings that say what a belief means.
-fn settings_hash(settings: &Settings) -> u64 {
-    let meaning = (
-        settings.forgetting,
-        settings.xi,
-        (settings.sigma_min, settings.sigma_max),
-        (settings.unseen_start, settings.unseen_variance),
-        (settings.earlier_appearance, settings.second_look),
-    );
-    form::checksum(format!("{meaning:?}").as_bytes())
-}
-
-/// What this service may do with the place.
-#[derive(Debug, Clone, PartialEq, Eq, Default)]
-pub enum Role {
-    /// The store has not been read yet.
-    #[default]
-    Unread,
-    /// Another service writes the place; this one answers questions.
-    Reader {
-        holder: String,
-    },
-    Writer,
-}
-
-/// What [`StoreStatus::role`] may be.
-pub const ROLES: [&str; 3] = ["unread", "reader", "writer"];
-
-/// For people and monitors.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
-pub struct StoreStatus {
-    /// One of [`ROLES`].
-    pub role: &'static str,
-    /// Who writes the place, where it is not this service.
-    pub holder: Option<String>,
-    /// Why the store cannot be used at present.
-    pub trouble: Option<String>,
-    /// Of the lease under which this service writes.
-    pub epoch: u64,
-    pub stored_viewpoints: usize,
-    pub stored_bytes: u64,
-    /// Viewpoints found when the place was read or taken over last.
-    pub recovered: usize,
-    /// Of those, learnt with other settings.
-    pub recovered_other_settings: usize,
-    /// Objects that could not be read, and where the first of them are.
-    pub damaged: u64,
-    pub damaged_names: Vec<String>,
-    /// Whole objects that are left as they are: of a later version of the form, or too large for these settings.
-    pub left_unread: usize,
-    /// Changes that are not stored yet, and the age of the oldest.
-    pub pending: usize,
-    pub pending_s: f64,
-    pub written: u64,
-    pub written_bytes: u64,
-    /// Stored later than `write_behind_s` after the change.
-    pub late: u64,
-    pub removed: u64,
-    pub write_failures: u64,
-    /// Changes that were lost because another service took the place while the store could not be reached.
-    pub lost: u64,
-    pub loaded: u64,
-    pub read_failures: u64,
-    /// Frames and questions that found all they needed in RAM, and those that had to wait for the store.
-    pub hits: u64,
-    pub misses: u64,
-    pub miss_seconds: f64,
-    /// Of the misses, those that went on without.
-    pub incomplete: u64,
-    /// Viewpoints expected to be needed that were too many to load.
-    pub not_prefetched: u64,
-}
-
-/// A change on its way to the store, and since when the store lacks one.
-#[derive(Debug, Clone)]
-pub(super) struct Pending {
-    /// `None`: removed.
-    pub written: Option<(Arc<Viewpoint>, u64)>,
-    pub since: Instant,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Known {
-    pub head: Head,
-    pub version: Version,
-    pub bytes: u64,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Unreadable {
-    pub name: String,
-    /// Else it is of another version of the form, or too large for these settings.
-    pub is_damaged: bool,
-}
-
-/// What the worker has to learn of the viewpoints, in this order.
-#[derive(Debug)]
-pub(super) enum News {
-    /// Everything is as the store says from here on.
-    Reset,
-    /// Ids up to this one are not to be given again.
-    Taken(u64),
-    Known(Vec<(Head, Version)>),
-    Gone(u64),
-    Loaded(Arc<Viewpoint>, Version),
-    Stored(u64, Version),
-}
-
-#[derive(Debug, Default)]
-pub(super) struct State {
-    pub role: Role,
-    pub epoch: u64,
-    /// Until when the lease allows to write.
-    pub trusted_until: Option<Instant>,
-    pub pending: BTreeMap<u64, Pending>,
-    /// Being written now; not in `pending`.
-    pub writing: usize,
-    /// What is stored, by id.
-    pub catalogue: BTreeMap<u64, Known>,
-    /// What is stored of the modes, and under which name.
-    pub modes: Modes,
-    pub modes_version: Option<Version>,
-    /// What was said about modes since, here. Who writes the place stores it.
-    pub modes_said: Modes,
-    /// The worker knows what these come to.
-    pub modes_told: bool,
-    pub events: EventNotes,
-    /// To be loaded, the next first.
-    pub wanted: VecDeque<u64>,
-    /// Being loaded.
-    pub fetching: BTreeSet<u64>,
-    /// Loaded, among the news.
-    pub loaded: BTreeSet<u64>,
-    pub news: Vec<News>,
-    /// Objects that cannot be read, as long as they are among the others.
-    pub unreadable: BTreeMap<(u64, Version), Unreadable>,
-    /// The store is not as the catalogue says.
-    pub stale: bool,
-    /// What went wrong, by who noticed.
-    pub trouble: BTreeMap<&'static str, String>,
-    pub counters: StoreStatus,
-    pub closing: bool,
-    pub closed: bool,
-}
-
-impl State {
-    fn is_awaited(&self, id: u64) -> bool {
-        self.fetching.contains(&id) || self.wanted.contains(&id)
-    }
-
-    /// Changes that are not stored yet.
-    pub fn unstored(&self) -> usize {
-        let modes = self.role == Role::Writer && !self.modes_said.is_empty();
-        self.pending.len() + self.writing + usize::from(modes) + self.events.unstored()
-    }
-
-    /// Whether the lease of this epoch still allows to write.
-    pub fn may_write(&self, epoch: u64) -> bool {
-        let trusted = self
-            .trusted_until
-            .is_some_and(|until| Instant::now() < until);
-        self.role == Role::Writer && self.epoch == epoch && trusted
-    }
-}
-
-pub(super) struct Shared {
-    pub place: Arc<str>,
-    pub shelf: Shelf,
-    pub options: PlaceOptions,
-    /// This service's name in leases.
-    pub name: String,
-    state: Mutex<State>,
-    /// Rung for who waits in [`PlaceStore::bring`], [`PlaceStore::wait_read`] and [`PlaceStore::close`].
-    arrived: Condvar,
-    pub for_writer: Notify,
-    pub for_loader: Notify,
-    pub for_keeper: Notify,
-    /// Wakes the worker.
-    wake: Box<dyn Fn() + Send + Sync>,
-}
-
-impl Shared {
-    pub fn lock(&self) -> MutexGuard<'_, State> {
-        // Nothing below panics between two changes that belong together.
-        self.state.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// After news or a change of role.
-    pub fn tell_worker(&self) {
-        self.arrived.notify_all();
-        (self.wake)();
-    }
-
-    pub fn tell_tasks(&self) {
-        self.for_writer.notify_one();
-        self.for_loader.notify_one();
-        self.for_keeper.notify_one();
-    }
-
-    /// Logs trouble when it begins and ends, not while it lasts.
-    pub fn trouble(&self, who: &'static str, what: Option<String>) {
-        let mut state = self.lock();
-        let before = match &what {
-            Some(what) => state.trouble.insert(who, what.clone()),
-            None => state.trouble.remove(who),
-        };
-        drop(state);
-        match (before, what) {
-            (None, Some(what)) => {
-                tracing::warn!(
-                    place = &*self.place,
-                    "the stored memory has trouble: {what}"
-                );
-            }
-            (Some(_), None) => {
-                tracing::info!(
-                    place = &*self.place,
-                    "the stored memory is well again ({who})"
-                );
-            }
-            _ => {}
-        }
-    }
-}
-
 /// The worker's end. Closed when dropped, without waiting.
 pub struct PlaceStore {
     shared: Arc<Shared>,
@@ -330,18 +63,7 @@ impl PlaceStore {
         runtime: &Handle,
         wake: impl Fn() + Send + Sync + 'static,
     ) -> Self {
-        let shared = Arc::new(Shared {
-            place: place.into(),
-            shelf: store.shelf(place),
-            options,
-            name: lease::own_name(),
-            state: Mutex::default(),
-            arrived: Condvar::new(),
-            for_writer: Notify::new(),
-            for_loader: Notify::new(),
-            for_keeper: Notify::new(),
-            wake: Box::new(wake),
-        });
+        let shared = Arc::new(Shared::new(place, store.shelf(place), options, wake));
         runtime.spawn(keeper::keep(shared.clone()));
         Self {
             shared,
@@ -351,7 +73,7 @@ impl PlaceStore {
 
     /// Waits until the store has been read; false if that takes too long.
     pub fn wait_read(&self, within: Duration) -> bool {
-        self.wait(within, |state| state.role != Role::Unread)
+        self.shared.wait(within, |state| state.role != Role::Unread)
     }
 
     pub fn role(&self) -> Role {
@@ -409,9 +131,25 @@ impl PlaceStore {
     pub fn keep_event(&self, id: u64, content: Option<Vec<u8>>) {
         let mut state = self.shared.lock();
         if state.role == Role::Writer {
-            state.events.keep(id, content.map(Bytes::from));
+            let by = Instant::now() + self.shared.options.write_behind_half();
+            state.events.keep(id, content.map(Bytes::from), by);
             self.shared.for_writer.notify_one();
         }
+    }
+
+    /// Keeps a camera's calibration, whose id it has: soon where this service writes the place, else when it does.
+    pub fn keep_calibration(&self, source: &Source, content: Vec<u8>) {
+        let id = form::checksum(format!("{}/{}", source.robot, source.camera).as_bytes());
+        let mut state = self.shared.lock();
+        let content = Some(Bytes::from(content));
+        state.calibrations.keep(id, content, Instant::now());
+        self.shared.for_writer.notify_one();
+    }
+
+    /// Stored calibrations that were not taken yet.
+    pub fn take_calibrations(&self) -> Vec<Bytes> {
+        let read = std::mem::take(&mut self.shared.lock().calibrations.read);
+        read.into_iter().map(|(_, content)| content).collect()
     }
 
     /// Stored events that were not taken yet.
@@ -547,7 +285,7 @@ impl PlaceStore {
     pub fn fetch_step(&self, memory: &mut Memory, ids: Vec<u64>) {
         if !self.fetch(memory, ids, BRING_STEP) {
             let is_hopeless = |state: &State| state.trouble.contains_key(loader::READING);
-            self.wait(BRING_STEP, |state| !is_hopeless(state));
+            self.shared.wait(BRING_STEP, |state| !is_hopeless(state));
         }
     }
 
@@ -594,9 +332,10 @@ impl PlaceStore {
             if is_hopeless {
                 break;
             }
-            self.wait(within.saturating_sub(began.elapsed()), |state| {
-                !left.iter().any(|id| state.is_awaited(*id))
-            });
+            self.shared
+                .wait(within.saturating_sub(began.elapsed()), |state| {
+                    !left.iter().any(|id| state.is_awaited(*id))
+                });
             self.sync(memory);
             left = memory.absent_of(&left);
             if left.is_empty() {
@@ -671,7 +410,7 @@ impl PlaceStore {
         self.sync(memory);
         self.shared.lock().closing = true;
         self.shared.tell_tasks();
-        let closed = self.wait(within, |state| state.closed);
+        let closed = self.shared.wait(within, |state| state.closed);
         let state = self.shared.lock();
         let left = state.unstored();
         if left > 0 {
@@ -681,24 +420,6 @@ impl PlaceStore {
             );
         }
         closed && left == 0
-    }
-
-    fn wait(&self, within: Duration, until: impl Fn(&State) -> bool) -> bool {
-        let deadline = Instant::now() + within;
-        let mut state = self.shared.lock();
-        while !until(&state) {
-            let left = deadline.saturating_duration_since(Instant::now());
-            if left.is_zero() {
-                return false;
-            }
-            state = self
-                .shared
-                .arrived
-                .wait_timeout(state, left)
-                .unwrap_or_else(PoisonError::into_inner)
-                .0;
-        }
-        true
     }
 }
 

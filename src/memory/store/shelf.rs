@@ -4,7 +4,8 @@
 //! PLACE/viewpoints/ID-EPOCH-REVISION    one object a viewpoint (see `form`); numbers in hexadecimal
 //! PLACE/lease/EPOCH                     who writes the place (see `lease`)
 //! PLACE/modes/EPOCH-REVISION            what was said about modes (see `modes`)
-//! PLACE/events/ID-EPOCH-REVISION        what is kept of an event (see `events`)
+//! PLACE/events/ID-EPOCH-REVISION        what is kept of an event (see `notes`)
+//! PLACE/calibrations/ID-EPOCH-REVISION  a camera's calibration (see `notes`); ID is the checksum of ROBOT/CAMERA
 //! PLACE/damaged/...                     what could not be read, under the name it had
 //! PLACE/lock                            on disk only: locked by the process that writes the place
 //! ```
@@ -24,13 +25,12 @@ use object_store::{
     Error, GetOptions, GetRange, ObjectStore, ObjectStoreExt, PutMode, PutOptions, path::Path,
 };
 
-use super::form::HEAD_BYTES_MAX;
+use super::{form::HEAD_BYTES_MAX, notes::Kind};
 use crate::memory::Version;
 
 pub const VIEWPOINTS: &str = "viewpoints";
 const LEASE: &str = "lease";
 const MODES: &str = "modes";
-const EVENTS: &str = "events";
 const DAMAGED: &str = "damaged";
 const LOCK: &str = "lock";
 
@@ -73,8 +73,8 @@ impl Shelf {
         self.state(VIEWPOINTS, id, version)
     }
 
-    pub fn event(&self, id: u64, version: Version) -> Path {
-        self.state(EVENTS, id, version)
+    pub fn note(&self, kind: Kind, id: u64, version: Version) -> Path {
+        self.state(kind.folder(), id, version)
     }
 
     fn state(&self, folder: &str, id: u64, version: Version) -> Path {
@@ -201,9 +201,10 @@ impl Shelf {
         }
     }
 
-    /// All states of all events.
-    pub async fn list_events(&self) -> Result<Vec<(u64, Version)>> {
-        let objects = self.objects.list(Some(&self.at.clone().join(EVENTS)));
+    /// All states of all notes of a kind.
+    pub async fn list_notes(&self, kind: Kind) -> Result<Vec<(u64, Version)>> {
+        let folder = self.at.clone().join(kind.folder());
+        let objects = self.objects.list(Some(&folder));
         let states = objects.try_filter_map(async |object| {
             let name = object.location.filename();
             Ok(name.and_then(parse))
@@ -212,22 +213,30 @@ impl Shelf {
     }
 
     /// `None` if it is larger than `bytes_max`, which is not read.
-    pub async fn get_event(
+    pub async fn get_note(
         &self,
+        kind: Kind,
         id: u64,
         version: Version,
         bytes_max: u64,
     ) -> Result<Option<Bytes>> {
-        self.get_whole(&self.event(id, version), bytes_max).await
+        self.get_whole(&self.note(kind, id, version), bytes_max)
+            .await
     }
 
-    pub async fn put_event(&self, id: u64, version: Version, object: Bytes) -> Result<()> {
-        self.put_once(&self.event(id, version), object).await
+    pub async fn put_note(
+        &self,
+        kind: Kind,
+        id: u64,
+        version: Version,
+        object: Bytes,
+    ) -> Result<()> {
+        self.put_once(&self.note(kind, id, version), object).await
     }
 
-    pub async fn delete_events(&self, states: &[(u64, Version)]) -> Result<()> {
+    pub async fn delete_notes(&self, kind: Kind, states: &[(u64, Version)]) -> Result<()> {
         for &(id, version) in states {
-            self.delete_one(&self.event(id, version)).await?;
+            self.delete_one(&self.note(kind, id, version)).await?;
         }
         Ok(())
     }
@@ -261,10 +270,11 @@ impl Shelf {
         self.rename_aside(&path, &format!("modes-{name}")).await
     }
 
-    pub async fn set_event_aside(&self, id: u64, version: Version) -> Result<Path> {
-        let path = self.event(id, version);
+    pub async fn set_note_aside(&self, kind: Kind, id: u64, version: Version) -> Result<Path> {
+        let path = self.note(kind, id, version);
         let name = path.filename().unwrap_or("nameless");
-        self.rename_aside(&path, &format!("event-{name}")).await
+        let aside = format!("{}-{name}", kind.name());
+        self.rename_aside(&path, &aside).await
     }
 
     pub async fn move_aside(&self, path: &Path) -> Result<Path> {
@@ -346,7 +356,9 @@ impl Shelf {
         let Some(folder) = &self.folder else {
             return Ok(());
         };
-        let folders = [VIEWPOINTS, MODES, EVENTS].map(|name| folder.join(name));
+        let notes = Kind::ALL.map(Kind::folder);
+        let names = [VIEWPOINTS, MODES].into_iter().chain(notes);
+        let folders: Vec<PathBuf> = names.map(|name| folder.join(name)).collect();
         on_disk(move || folders.iter().try_for_each(|folder| sweep_folder(folder))).await
     }
 }

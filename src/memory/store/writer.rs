@@ -8,10 +8,11 @@ use futures_util::{StreamExt, stream};
 use tokio::{task::spawn_blocking, time};
 
 use super::{
-    Backoff, events,
+    Backoff,
     form::{self, Label},
     modes,
-    place::{Known, News, Pending, Role, Shared},
+    notes::{self, Kind},
+    shared::{Known, News, Pending, Role, Shared},
     shelf,
 };
 use crate::{memory::Version, model::mode::Modes};
@@ -31,7 +32,8 @@ enum Due {
         version: Version,
         said: Modes,
     },
-    Events {
+    Notes {
+        kind: Kind,
         epoch: u64,
         changes: BTreeMap<u64, Option<Bytes>>,
     },
@@ -64,8 +66,12 @@ pub async fn write(shared: Arc<Shared>) {
                 let written = write_modes(&shared, version, said).await;
                 note_written(&shared, written, &mut backoff).await;
             }
-            Due::Events { epoch, changes } => {
-                let written = events::write(&shared, epoch, changes).await;
+            Due::Notes {
+                kind,
+                epoch,
+                changes,
+            } => {
+                let written = notes::write(&shared, kind, epoch, changes).await;
                 note_written(&shared, written, &mut backoff).await;
             }
         }
@@ -98,9 +104,11 @@ fn due(shared: &Shared) -> Due {
             said: state.modes_said.clone(),
         };
     }
-    let pending = state.pending.values().map(|pending| pending.since);
-    let oldest = pending.chain(state.events.since).min();
-    let Some(oldest) = oldest else {
+    let write_behind = shared.options.write_behind_half();
+    let pending = state.pending.values();
+    let pending = pending.map(|pending| pending.since + write_behind);
+    let notes = state.events.due.into_iter().chain(state.calibrations.due);
+    let Some(at) = pending.chain(notes).min() else {
         return if state.closing {
             Due::End
         } else {
@@ -112,14 +120,20 @@ fn due(shared: &Shared) -> Due {
         let gone = state.closing && state.role != Role::Writer;
         return if gone { Due::End } else { Due::Nothing };
     }
-    let at = oldest + shared.options.write_behind / 2;
     if !state.closing && Instant::now() < at {
         return Due::At(at);
     }
-    if state.events.since.take().is_some() {
-        let changes = std::mem::take(&mut state.events.pending);
-        state.events.writing = changes.len();
-        return Due::Events { epoch, changes };
+    for kind in Kind::ALL {
+        let notes = state.notes(kind);
+        if notes.due.take().is_some() {
+            let changes = std::mem::take(&mut notes.pending);
+            notes.writing = changes.len();
+            return Due::Notes {
+                kind,
+                epoch,
+                changes,
+            };
+        }
     }
     let changes: Vec<(u64, Pending)> = std::mem::take(&mut state.pending).into_iter().collect();
     state.writing = changes.len();

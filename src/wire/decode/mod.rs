@@ -12,7 +12,7 @@ mod rig;
 use prost::Message;
 use prost_types::Timestamp;
 
-pub use rig::{calibration, markers_sample};
+pub use rig::{calibration, camera_calibration, markers_sample};
 
 use super::proto;
 use crate::{

@@ -6,12 +6,12 @@ use super::{POSITION_MAX_M, intrinsics, message, pose, required_stamp_ns};
 use crate::{
     model::{
         camera::{Plate, RigCalibration, SideCalibration, SideCalibrations},
-        frame::MarkersInWorld,
+        frame::{MarkersInWorld, Source},
         pose::Pose,
         refusal::Refusal,
     },
     stages::localise::MIN_MARKERS,
-    wire::proto,
+    wire::{keys, proto},
 };
 
 /// The paper's plate has four.
@@ -38,6 +38,23 @@ pub fn calibration(calibration: &proto::Calibration) -> Result<RigCalibration, R
         sides: sides(calibration)?,
         plate: plate(calibration)?,
     })
+}
+
+/// What [`crate::wire::encode::camera_calibration`] made.
+///
+/// # Errors
+/// As [`calibration`], and bytes that are no such message, or of nobody.
+pub fn camera_calibration(bytes: &[u8]) -> Result<(Source, RigCalibration), Refusal> {
+    let kept: proto::CameraCalibration = message(bytes)?;
+    if !(keys::is_id(&kept.robot) && keys::is_id(&kept.camera)) {
+        return Err(Refusal::new("calibration", "it is of no camera"));
+    }
+    let source = Source {
+        robot: kept.robot.into(),
+        camera: kept.camera.into(),
+    };
+    let calibration = calibration(&kept.calibration.unwrap_or_default())?;
+    Ok((source, calibration))
 }
 
 fn sides(calibration: &proto::Calibration) -> Result<Option<SideCalibrations>, Refusal> {

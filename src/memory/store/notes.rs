@@ -1,5 +1,5 @@
-//! What is kept about a place's events beside its viewpoints: one object an event, whose content is the service's; after
-//! it eight bytes, the checksum of everything before, little-endian. The newest state of an event wins.
+//! What is kept of a place beside its viewpoints, of each event and each camera's calibration: one object, whose content
+//! is the service's; after it eight bytes, the checksum of everything before, little-endian. The newest state wins.
 
 use std::{collections::BTreeMap, time::Instant};
 
@@ -9,7 +9,7 @@ use object_store::Error;
 
 use super::{
     form::{FormError, checksum},
-    place::{Role, Shared},
+    shared::{Role, Shared},
     shelf::Result,
 };
 use crate::memory::Version;
@@ -20,13 +20,39 @@ const BYTES_MAX: u64 = 1 << 20;
 /// Most of a request is waiting.
 const AT_ONCE: usize = 8;
 
-/// Of a place.
+/// What a note is of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    Event,
+    Calibration,
+}
+
+impl Kind {
+    pub const ALL: [Self; 2] = [Self::Event, Self::Calibration];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Event => "event",
+            Self::Calibration => "calibration",
+        }
+    }
+
+    /// Where they lie.
+    pub fn folder(self) -> &'static str {
+        match self {
+            Self::Event => "events",
+            Self::Calibration => "calibrations",
+        }
+    }
+}
+
+/// Those of a kind, of a place.
 #[derive(Debug, Default)]
-pub struct EventNotes {
+pub struct Notes {
     /// To be written, or deleted where there is nothing.
     pub pending: BTreeMap<u64, Option<Bytes>>,
-    /// Since when.
-    pub since: Option<Instant>,
+    /// By when.
+    pub due: Option<Instant>,
     /// Being written now; not in `pending`.
     pub writing: usize,
     /// Under which names they are stored.
@@ -35,17 +61,19 @@ pub struct EventNotes {
     pub read: Vec<(u64, Bytes)>,
 }
 
-/// What of the stored events is of no use.
-#[derive(Debug, Default)]
+/// What of the stored ones is of no use.
+#[derive(Debug)]
 pub struct Useless {
+    kind: Kind,
     superseded: Vec<(u64, Version)>,
     damaged: Vec<(u64, Version)>,
 }
 
-impl EventNotes {
-    pub fn keep(&mut self, id: u64, content: Option<Bytes>) {
+impl Notes {
+    /// Until `by`, if the store can be reached.
+    pub fn keep(&mut self, id: u64, content: Option<Bytes>, by: Instant) {
         self.pending.insert(id, content);
-        self.since.get_or_insert_with(Instant::now);
+        self.due = Some(self.due.map_or(by, |due| due.min(by)));
     }
 
     pub fn unstored(&self) -> usize {
@@ -67,38 +95,50 @@ fn sealed(content: &[u8]) -> Bytes {
     [content, &sum].concat().into()
 }
 
-fn opened(object: &Bytes) -> std::result::Result<Bytes, FormError> {
+/// The content of an object.
+///
+/// # Errors
+/// Bytes that were not written here, or damaged.
+pub fn opened(object: &Bytes) -> std::result::Result<Bytes, FormError> {
     let got = object.len();
     let short = FormError::Short { got };
     let end = got.checked_sub(SUM_BYTES).ok_or(short)?;
     let (content, sum) = object.split_at(end);
     if *sum != checksum(content).to_le_bytes() {
-        return Err(FormError::Checksum { part: "event" });
+        return Err(FormError::Checksum { part: "content" });
     }
     Ok(object.slice(..end))
 }
 
-/// Learns what is stored: of each event the newest state that can be read.
-pub async fn refresh(shared: &Shared) -> Result<Useless> {
+/// Learns what is stored of a kind: of each the newest state that can be read.
+pub async fn refresh(shared: &Shared, kind: Kind) -> Result<Useless> {
     let mut states: BTreeMap<u64, Vec<Version>> = BTreeMap::new();
-    for (id, version) in shared.shelf.list_events().await? {
+    for (id, version) in shared.shelf.list_notes(kind).await? {
         states.entry(id).or_default().push(version);
     }
-    let known = shared.lock().events.stored.clone();
+    let known = shared.lock().notes(kind).stored.clone();
     let reads = states.into_iter().map(async |(id, mut versions)| {
         versions.sort_unstable();
         let known = known.get(&id).copied();
-        newest_readable(shared, id, versions, known).await
+        newest_readable(shared, kind, id, versions, known).await
     });
     let newest: Vec<Newest> = stream::iter(reads).buffered(AT_ONCE).try_collect().await?;
-    let mut useless = Useless::default();
+    let mut useless = Useless {
+        kind,
+        superseded: Vec::new(),
+        damaged: Vec::new(),
+    };
     let mut state = shared.lock();
-    for Newest { read, mut rest } in newest {
-        useless.superseded.append(&mut rest.superseded);
-        useless.damaged.append(&mut rest.damaged);
-        if let Some((id, version, content)) = read {
-            state.events.stored.insert(id, version);
-            state.events.read.push((id, content));
+    let notes = state.notes(kind);
+    for mut one in newest {
+        useless.superseded.append(&mut one.superseded);
+        useless.damaged.append(&mut one.damaged);
+        if let Some((id, version, content)) = one.read {
+            notes.stored.insert(id, version);
+            // What is to be written is newer.
+            if !notes.pending.contains_key(&id) {
+                notes.read.push((id, content));
+            }
         }
     }
     Ok(useless)
@@ -107,12 +147,14 @@ pub async fn refresh(shared: &Shared) -> Result<Useless> {
 #[derive(Default)]
 struct Newest {
     read: Option<(u64, Version, Bytes)>,
-    rest: Useless,
+    superseded: Vec<(u64, Version)>,
+    damaged: Vec<(u64, Version)>,
 }
 
 /// `versions` rise; of `known` the content is known.
 async fn newest_readable(
     shared: &Shared,
+    kind: Kind,
     id: u64,
     mut versions: Vec<Version>,
     known: Option<Version>,
@@ -120,7 +162,7 @@ async fn newest_readable(
     let mut newest = Newest::default();
     while let Some(version) = versions.pop() {
         if known != Some(version) {
-            let got = match shared.shelf.get_event(id, version, BYTES_MAX).await {
+            let got = match shared.shelf.get_note(kind, id, version, BYTES_MAX).await {
                 // Superseded meanwhile.
                 Err(Error::NotFound { .. }) => continue,
                 got => got?,
@@ -128,13 +170,14 @@ async fn newest_readable(
             match got.map_or(Err(FormError::TooLong), |object| opened(&object)) {
                 Ok(content) => newest.read = Some((id, version, content)),
                 Err(error) => {
-                    let path = shared.shelf.event(id, version);
+                    let path = shared.shelf.note(kind, id, version);
                     tracing::error!(
                         place = &*shared.place,
-                        "the event in {path} is lost: {error}"
+                        "the {} in {path} is lost: {error}",
+                        kind.name()
                     );
                     if error.is_damage() {
-                        newest.rest.damaged.push((id, version));
+                        newest.damaged.push((id, version));
                     }
                     continue;
                 }
@@ -143,15 +186,16 @@ async fn newest_readable(
         break;
     }
     let superseded = versions.into_iter().map(|version| (id, version));
-    newest.rest.superseded.extend(superseded);
+    newest.superseded.extend(superseded);
     Ok(newest)
 }
 
 /// Deletes what is superseded and sets aside what is damaged; how many. Only for who writes the place.
 pub async fn tidy(shared: &Shared, useless: Useless) -> Result<usize> {
-    shared.shelf.delete_events(&useless.superseded).await?;
+    let kind = useless.kind;
+    shared.shelf.delete_notes(kind, &useless.superseded).await?;
     for &(id, version) in &useless.damaged {
-        shared.shelf.set_event_aside(id, version).await?;
+        shared.shelf.set_note_aside(kind, id, version).await?;
     }
     Ok(useless.damaged.len())
 }
@@ -159,40 +203,51 @@ pub async fn tidy(shared: &Shared, useless: Useless) -> Result<usize> {
 /// Stores what changed; what fails is pending again.
 pub async fn write(
     shared: &Shared,
+    kind: Kind,
     epoch: u64,
     changes: BTreeMap<u64, Option<Bytes>>,
 ) -> Result<()> {
     let mut writes = stream::iter(changes)
         .map(async |(id, content)| {
-            let done = write_one(shared, epoch, id, content.as_ref()).await;
+            let done = write_one(shared, kind, epoch, id, content.as_ref()).await;
             (id, content, done)
         })
         .buffer_unordered(AT_ONCE);
     let mut failed = None;
     while let Some((id, content, done)) = writes.next().await {
         let mut state = shared.lock();
-        state.events.writing -= 1;
+        state.notes(kind).writing -= 1;
         if let Err(error) = done {
             failed = Some(error);
             if state.role == Role::Writer && state.epoch == epoch {
                 // What came since is newer.
-                state.events.pending.entry(id).or_insert(content);
-                state.events.since.get_or_insert_with(Instant::now);
+                let notes = state.notes(kind);
+                notes.pending.entry(id).or_insert(content);
+                notes.due.get_or_insert_with(Instant::now);
             }
         }
     }
     failed.map_or(Ok(()), Err)
 }
 
-async fn write_one(shared: &Shared, epoch: u64, id: u64, content: Option<&Bytes>) -> Result<()> {
+async fn write_one(
+    shared: &Shared,
+    kind: Kind,
+    epoch: u64,
+    id: u64,
+    content: Option<&Bytes>,
+) -> Result<()> {
     let (before, version) = {
-        let state = shared.lock();
-        let before = state.events.stored.get(&id).copied();
-        (before, state.events.next_version(id, epoch))
+        let mut state = shared.lock();
+        let notes = state.notes(kind);
+        (
+            notes.stored.get(&id).copied(),
+            notes.next_version(id, epoch),
+        )
     };
     if let Some(content) = content {
         let object = sealed(content);
-        shared.shelf.put_event(id, version, object).await?;
+        shared.shelf.put_note(kind, id, version, object).await?;
     }
     {
         let mut state = shared.lock();
@@ -200,12 +255,12 @@ async fn write_one(shared: &Shared, epoch: u64, id: u64, content: Option<&Bytes>
             return Ok(());
         }
         match content {
-            Some(_) => state.events.stored.insert(id, version),
-            None => state.events.stored.remove(&id),
+            Some(_) => state.notes(kind).stored.insert(id, version),
+            None => state.notes(kind).stored.remove(&id),
         };
     }
     match before {
-        Some(before) => shared.shelf.delete_events(&[(id, before)]).await,
+        Some(before) => shared.shelf.delete_notes(kind, &[(id, before)]).await,
         None => Ok(()),
     }
 }

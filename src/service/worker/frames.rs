@@ -1,0 +1,250 @@
+//! A camera's frames and what comes beside them: from a message to a report, or to why there is none.
+
+use std::time::Instant;
+
+use super::{Desk, Worker, telling::snapshot};
+use crate::{
+    memory::store::PlaceStore,
+    model::{frame::Source, mode::Mode, pose::Pose, refusal::Refusal},
+    service::{
+        camera::{Camera, Refused, Turn, unpack},
+        inbox::Aside,
+        publish::CameraPublisher,
+        turns,
+    },
+    wire::{
+        decode::{self, PackedFrame},
+        encode,
+        keys::{self, CameraPath},
+        proto,
+    },
+};
+
+impl Desk {
+    /// The camera's entry, made when it is first heard of; `None` when the session is closing.
+    fn camera(&mut self, source: &Source) -> Option<&mut Camera> {
+        if !self.cameras.contains_key(source) {
+            let path = CameraPath {
+                place: self.worker.place.clone(),
+                source: source.clone(),
+            };
+            let Worker { session, root, .. } = &self.worker;
+            match CameraPublisher::new(session, root, &path) {
+                Ok(publisher) => {
+                    let mut camera = Camera::new(path, publisher);
+                    if let Some(known) = self.calibrations.get(source) {
+                        camera.remember_calibration(known, self.limits);
+                    }
+                    self.cameras.insert(source.clone(), camera);
+                }
+                Err(error) => {
+                    tracing::warn!("no publishers for {}: {error}", path.key(root, ""));
+                    return None;
+                }
+            }
+        }
+        self.cameras.get_mut(source)
+    }
+
+    pub(super) fn aside(&mut self, source: &Source, aside: Aside) {
+        let limits = self.limits;
+        let set = match aside {
+            Aside::Mode(mode) => self.set_mode(Some(source), mode),
+            _ => Ok(()),
+        };
+        let Some(camera) = self.camera(source) else {
+            return;
+        };
+        let (leaf, result) = match aside {
+            Aside::Pose(payload) => (
+                keys::POSE,
+                decode::pose_sample(&payload.to_bytes())
+                    .and_then(|(stamp_ns, pose)| camera.track.push(stamp_ns, pose)),
+            ),
+            Aside::Markers(payload) => (
+                keys::MARKERS,
+                decode::markers_sample(&payload.to_bytes())
+                    .map(|(stamp_ns, markers)| camera.put_markers(stamp_ns, markers)),
+            ),
+            Aside::Calibration(payload) => (
+                keys::CALIBRATION,
+                decode::message::<proto::Calibration>(&payload.to_bytes())
+                    .and_then(|message| decode::calibration(&message))
+                    .and_then(|calibration| camera.set_calibration(calibration, limits)),
+            ),
+            Aside::Mode(_) => (keys::MODE, set),
+            Aside::Refused(leaf, refusal) => (leaf, Err(refusal)),
+        };
+        if leaf == keys::CALIBRATION && result.is_ok() {
+            self.keep_calibration(source);
+        }
+        if let Err(refusal) = result {
+            self.refuse(
+                source,
+                leaf,
+                Refused {
+                    refusal,
+                    stamp_ns: 0,
+                    sequence: 0,
+                },
+            );
+        }
+    }
+
+    pub(super) fn receive_frame(&mut self, source: &Source) {
+        let limits = self.limits;
+        let Some((arrival, replaced)) = self.worker.inbox.take_frame(source) else {
+            return;
+        };
+        let Some(camera) = self.camera(source) else {
+            return;
+        };
+        if let Err(refused) = camera.receive(arrival, replaced, limits) {
+            self.refuse(source, keys::FRAME, refused);
+        }
+    }
+
+    /// Makes poses of the markers whose plate is known by now.
+    pub(super) fn fit_markers(&mut self) {
+        let refused: Vec<(Source, Refused)> = self
+            .cameras
+            .iter_mut()
+            .flat_map(|(source, camera)| {
+                let refused = camera.fit_markers();
+                refused.into_iter().map(|refused| (source.clone(), refused))
+            })
+            .collect();
+        for (source, refused) in refused {
+            self.refuse(&source, keys::MARKERS, refused);
+        }
+    }
+    /// Serves the ready frame of the camera that was served longest ago.
+    pub(super) fn serve_longest_waiting(&mut self, but: &[Source]) -> turns::Turn {
+        let now = Instant::now();
+        let mut wake: Option<Instant> = None;
+        let mut order: Vec<Source> = self
+            .cameras
+            .values()
+            .filter(|camera| camera.waiting.is_some() && !but.contains(&camera.path.source))
+            .map(|camera| camera.path.source.clone())
+            .collect();
+        order.sort_by_key(|source| self.cameras.get(source).map(|camera| camera.served));
+        for source in order {
+            let Some(camera) = self.cameras.get_mut(&source) else {
+                continue;
+            };
+            match camera.turn(now, self.pose_wait, &self.worker.ask_calibration) {
+                None => {}
+                Some(Turn::Until(deadline)) => {
+                    wake = Some(wake.map_or(deadline, |wake| wake.min(deadline)));
+                }
+                Some(Turn::Refused(refused)) => self.refuse(&source, keys::FRAME, refused),
+                Some(Turn::Ready(pose, packed, arrived)) => {
+                    self.frames += 1;
+                    camera.served = self.frames;
+                    let (stamp_ns, sequence) = (packed.stamp_ns, packed.sequence);
+                    if let Err(refusal) = self.serve_frame(&source, pose, &packed, arrived) {
+                        self.frames -= 1;
+                        self.refuse(
+                            &source,
+                            keys::FRAME,
+                            Refused {
+                                refusal,
+                                stamp_ns,
+                                sequence,
+                            },
+                        );
+                    }
+                    return turns::Turn {
+                        served: Some(source),
+                        wake: None,
+                    };
+                }
+            }
+        }
+        turns::Turn { served: None, wake }
+    }
+
+    fn serve_frame(
+        &mut self,
+        source: &Source,
+        pose: Pose,
+        packed: &PackedFrame,
+        arrived: Instant,
+    ) -> Result<(), Refusal> {
+        self.may_recall()?;
+        // Asked before the modes: whoever has become the place's writer has read what the last one was told.
+        let may_learn = self.worker.memory.as_ref().map(PlaceStore::may_learn);
+        self.sync_modes();
+        let mode = self.mode(source);
+        if mode == Mode::Learn {
+            may_learn.unwrap_or(Ok(()))?;
+        }
+        let mut stopwatch = self.stopwatches.start();
+        let (limits, noise) = (self.limits, self.noise_default);
+        let Some(camera) = self.cameras.get_mut(source) else {
+            return Ok(());
+        };
+        let lenses = camera.lenses(packed.calibration.as_ref(), limits)?;
+        let frame = unpack(packed, &lenses, source.clone(), pose, noise, limits)?;
+        stopwatch.decoded();
+        let Worker {
+            place,
+            pipeline,
+            memory,
+            ..
+        } = &mut self.worker;
+        if let Some(memory) = memory {
+            memory.bring(pipeline.memory_mut(), &pose);
+        }
+        let report = pipeline.process_staged(mode, &frame, &mut |stage| stopwatch.ended(stage))?;
+        if let Some(memory) = memory {
+            let held = pipeline.memory_mut();
+            memory.sync(held);
+            memory.prefetch(held, source, (frame.stamp_ns, report.world_from_camera));
+        }
+        let processing_seconds = stopwatch.elapsed().as_secs_f64();
+        self.maps_of = Some(source.clone());
+        let message = encode::report(&report, place, processing_seconds);
+        camera.publisher.report(&message);
+        camera.publisher.maps(&report, || pipeline.maps());
+        stopwatch.published(arrived);
+        camera.processed(
+            frame.image,
+            lenses,
+            report.world_from_camera,
+            message,
+            frame.stamp_ns,
+        );
+        if camera.watched(Instant::now()) {
+            camera.show(|image, report| snapshot(pipeline, image, report));
+        }
+        self.keep_calibration(source);
+        self.tell(&report);
+        Ok(())
+    }
+
+    fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
+        let root = self.worker.root.clone();
+        *self.refused_by.entry(refused.refusal.code).or_default() += 1;
+        let Some(camera) = self.camera(source) else {
+            return;
+        };
+        let Refused {
+            refusal,
+            stamp_ns,
+            sequence,
+        } = refused;
+        let key = camera.path.key(&root, leaf);
+        let count = camera.status.refused.entry(refusal.code).or_default();
+        *count += 1;
+        // Once is news; a robot that goes on would fill the log.
+        if *count == 1 {
+            tracing::warn!(code = refusal.code, "refused on {key}: {refusal}");
+        } else {
+            tracing::debug!(code = refusal.code, "refused on {key}: {refusal}");
+        }
+        camera.publisher.refused(&key, &refusal, stamp_ns, sequence);
+        camera.status.last_refusal = Some(format!("{}: {refusal}", refusal.code));
+    }
+}
