@@ -5,7 +5,7 @@
 
 use crate::{
     isa::{Isa, for_each_isa},
-    lanes::LANES,
+    lanes::{LANES, greatest, least, load_or},
 };
 
 /// Pixels darker than this in expectation carry too little for a ratio, grey levels.
@@ -18,6 +18,9 @@ const GAIN_MIN: f32 = 0.7;
 const GAIN_MAX: f32 = 1.4;
 /// Histogram bins between the bounds: a step of 0.03 %.
 const BINS: usize = 2048;
+/// So many histograms take turns: most ratios are alike, and counting into the bin that was just counted into waits for it.
+const TURNS: usize = 4;
+const _: () = assert!(LANES.is_multiple_of(TURNS));
 
 /// `rows` yields (expected luminance, coverage, observed luminance), a row each. 1 where nothing can be compared.
 pub fn exposure_gain<'a>(rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [f32])>) -> f32 {
@@ -32,37 +35,39 @@ pub fn exposure_gain<'a>(rows: impl Iterator<Item = (&'a [f32], &'a [f32], &'a [
 /// bounds.
 #[derive(Clone)]
 pub struct ExposureRatios {
-    /// The last bin is for what cannot be compared.
-    histogram: [u32; BINS + 1],
+    /// The last bin is for what cannot be compared, and for nothing at all.
+    histograms: [[u32; BINS + 1]; TURNS],
 }
 
 impl Default for ExposureRatios {
     fn default() -> Self {
         Self {
-            histogram: [0; BINS + 1],
+            histograms: [[0; BINS + 1]; TURNS],
         }
     }
 }
 
 impl ExposureRatios {
     pub fn clear(&mut self) {
-        self.histogram.fill(0);
+        self.histograms.as_flattened_mut().fill(0);
     }
 
     /// Of a row: expected luminance, coverage, observed luminance.
     pub fn count(&mut self, isa: Isa, expected: &[f32], coverage: &[f32], observed: &[f32]) {
-        count_row(isa, expected, coverage, observed, &mut self.histogram);
+        count_row(isa, expected, coverage, observed, &mut self.histograms);
     }
 
     pub fn add(&mut self, other: &Self) {
-        for (sum, members) in self.histogram.iter_mut().zip(&other.histogram) {
+        let sums = self.histograms.as_flattened_mut().iter_mut();
+        for (sum, members) in sums.zip(other.histograms.as_flattened()) {
             *sum += members;
         }
     }
 
     /// The median; 1 of none.
     pub fn gain(&self) -> f32 {
-        let bins = &self.histogram[..BINS];
+        let bins: [u32; BINS] =
+            std::array::from_fn(|bin| self.histograms.iter().map(|turn| turn[bin]).sum());
         let count: u32 = bins.iter().sum();
         let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
         if count == 0 {
@@ -86,7 +91,7 @@ for_each_isa! {
         expected: &[f32],
         coverage: &[f32],
         observed: &[f32],
-        histogram: &mut [u32; BINS + 1],
+        histograms: &mut [[u32; BINS + 1]; TURNS],
     ) = count_kernel;
 }
 
@@ -95,27 +100,30 @@ fn count_kernel(
     expected: &[f32],
     coverage: &[f32],
     observed: &[f32],
-    histogram: &mut [u32; BINS + 1],
+    histograms: &mut [[u32; BINS + 1]; TURNS],
 ) {
     let scale = BINS as f32 / (GAIN_MAX - GAIN_MIN);
-    let mut bins = [0u32; LANES];
     for start in (0..expected.len()).step_by(LANES) {
-        let end = expected.len().min(start + LANES);
-        let (expected, coverage) = (&expected[start..end], &coverage[start..end]);
-        let observed = &observed[start..end];
-        for lane in 0..end - start {
-            let (tau, y) = (expected[lane], observed[lane]);
+        // Nobody saw what is beyond the last pixel.
+        let [tau, coverage, y] =
+            [expected, coverage, observed].map(|row| load_or(0.0, &row[start..]));
+        let mut bins = [0u32; LANES];
+        for lane in 0..LANES {
+            let (tau, y) = (tau[lane], y[lane]);
             let comparable = (coverage[lane] > 0.0)
                 & (tau > EXPECTED_MIN)
                 & (y > OBSERVED_MIN)
                 & (y < OBSERVED_MAX);
             let bin = (y / tau - GAIN_MIN) * scale;
-            // The cast saturates below at 0.
-            let bin = (bin as u32).min(BINS as u32 - 1);
+            let bin = least(greatest(bin, 0.0), (BINS - 1) as f32);
+            // SAFETY: between 0 and `BINS - 1`; what is no number became 0.
+            let bin: u32 = unsafe { bin.to_int_unchecked() };
             bins[lane] = if comparable { bin } else { BINS as u32 };
         }
-        for &bin in &bins[..end - start] {
-            histogram[bin as usize] += 1;
+        for bins in bins.as_chunks::<TURNS>().0 {
+            for (histogram, &bin) in histograms.iter_mut().zip(bins) {
+                histogram[bin as usize] += 1;
+            }
         }
     }
 }

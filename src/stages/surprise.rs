@@ -75,9 +75,12 @@ impl GammaTerm {
     #[inline(always)]
     pub fn at(&self, alpha0: f32) -> f32 {
         let t = (alpha0 - self.center) * self.scale;
+        // By three, so that no term waits for all after it.
+        let cube = t * t * t;
         let mut sum = self.coefficients[DEGREE];
-        for power in (0..DEGREE).rev() {
-            sum = sum * t + self.coefficients[power];
+        for power in (0..DEGREE).step_by(3).rev() {
+            let c = &self.coefficients[power..power + 3];
+            sum = sum * cube + ((c[2] * t + c[1]) * t + c[0]);
         }
         sum
     }
@@ -208,54 +211,96 @@ fn log_predictive(belief: &Belief, observed: [f32; CHANNELS]) -> f32 {
     sum
 }
 
-/// Mean squared one-sided difference of one plane in x plus that in y: G of step 4, squared grey levels a pixel.
-/// Differences to pixels that nobody saw do not count. `None` = beyond the image.
-#[inline(always)]
-pub fn edge_gradient_row(
-    plane: (Option<&[f32]>, &[f32], Option<&[f32]>),
-    coverage: (Option<&[f32]>, &[f32], Option<&[f32]>),
-    gradient: &mut [f32],
-) {
-    let width = gradient.len();
-    let (above, here, below) = plane;
-    let (seen_above, seen, seen_below) = coverage;
-    // Beyond the image there is nothing to compare with: any row does, with no weight.
-    let (above, has_above) = above.map_or((here, 0.0), |row| (row, 1.0));
-    let (below, has_below) = below.map_or((here, 0.0), |row| (row, 1.0));
-    let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
-    let seen_above = &seen_above.unwrap_or(seen)[..width];
-    let seen_below = &seen_below.unwrap_or(seen)[..width];
-    let seen = &seen[..width];
-    for x in 0..width {
-        let (up, has_up) = squared(here[x], seen[x], above[x], seen_above[x], has_above);
-        let (down, has_down) = squared(here[x], seen[x], below[x], seen_below[x], has_below);
-        gradient[x] = mean_of_two(up + down, has_up + has_down);
+/// How much each pixel's differences to those around it count in G of step 4: the two of an axis are averaged, those to
+/// pixels that nobody saw or beyond the image do not count. The same for every channel.
+#[derive(Debug, Default)]
+pub struct EdgeWeights {
+    above: Vec<f32>,
+    left: Vec<f32>,
+    right: Vec<f32>,
+    below: Vec<f32>,
+}
+
+/// A plane's row between its neighbours; `None` = beyond the image.
+pub type RowAround<'a> = (Option<&'a [f32]>, &'a [f32], Option<&'a [f32]>);
+
+impl EdgeWeights {
+    /// From how many views saw the pixels.
+    #[inline(always)]
+    pub fn find(&mut self, (above, here, below): RowAround) {
+        let width = here.len();
+        for plane in [
+            &mut self.above,
+            &mut self.left,
+            &mut self.right,
+            &mut self.below,
+        ] {
+            plane.clear();
+            plane.resize(width, 0.0);
+        }
+        let [above, below] =
+            [(above, &mut self.above), (below, &mut self.below)].map(|(coverage, weights)| {
+                if let Some(coverage) = coverage {
+                    for ((weight, &there), &here) in weights.iter_mut().zip(coverage).zip(here) {
+                        *weight = both_seen(here, there);
+                    }
+                }
+                weights
+            });
+        average(above, below);
+        if width < 2 {
+            return;
+        }
+        let pairs = here.iter().zip(&here[1..]);
+        let weights = self.right.iter_mut().zip(&mut self.left[1..]);
+        for ((right, left), (&a, &b)) in weights.zip(pairs) {
+            *right = both_seen(a, b);
+            *left = *right;
+        }
+        average(&mut self.left, &mut self.right);
     }
-    if width < 2 {
-        return;
-    }
-    for x in 1..width - 1 {
-        let (left, has_left) = squared(here[x], seen[x], here[x - 1], seen[x - 1], 1.0);
-        let (right, has_right) = squared(here[x], seen[x], here[x + 1], seen[x + 1], 1.0);
-        gradient[x] += mean_of_two(left + right, has_left + has_right);
-    }
-    for (x, neighbour) in [(0, 1), (width - 1, width - 2)] {
-        gradient[x] += squared(here[x], seen[x], here[neighbour], seen[neighbour], 1.0).0;
+
+    /// Mean squared one-sided difference of one plane in x plus that in y: G of step 4, squared grey levels a pixel.
+    #[inline(always)]
+    pub fn gradient(&self, (above, here, below): RowAround, gradient: &mut [f32]) {
+        let width = gradient.len();
+        // Beyond the image any row does, as it has no weight.
+        let (above, below) = (above.unwrap_or(here), below.unwrap_or(here));
+        let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
+        let (above_weight, below_weight) = (&self.above[..width], &self.below[..width]);
+        for x in 0..width {
+            gradient[x] = squared(here[x], above[x]) * above_weight[x]
+                + squared(here[x], below[x]) * below_weight[x];
+        }
+        if width < 2 {
+            return;
+        }
+        let (left_weight, right_weight) = (&self.left[..width], &self.right[..width]);
+        for x in 1..width - 1 {
+            gradient[x] += squared(here[x], here[x - 1]) * left_weight[x]
+                + squared(here[x], here[x + 1]) * right_weight[x];
+        }
+        gradient[0] += squared(here[0], here[1]) * right_weight[0];
+        gradient[width - 1] += squared(here[width - 1], here[width - 2]) * left_weight[width - 1];
     }
 }
 
-/// Squared difference and how much it counts.
 #[inline(always)]
-fn squared(a: f32, seen_a: f32, b: f32, seen_b: f32, there: f32) -> (f32, f32) {
-    let both = if (seen_a > 0.0) & (seen_b > 0.0) {
-        there
-    } else {
-        0.0
-    };
-    ((a - b) * (a - b) * both, both)
+fn both_seen(a: f32, b: f32) -> f32 {
+    if (a > 0.0) & (b > 0.0) { 1.0 } else { 0.0 }
+}
+
+/// Where both count, each does by half.
+#[inline(always)]
+fn average(a: &mut [f32], b: &mut [f32]) {
+    for (a, b) in a.iter_mut().zip(b) {
+        let share = if *a + *b > 1.0 { 0.5 } else { 1.0 };
+        *a *= share;
+        *b *= share;
+    }
 }
 
 #[inline(always)]
-fn mean_of_two(sum: f32, count: f32) -> f32 {
-    if count > 1.0 { 0.5 * sum } else { sum }
+fn squared(a: f32, b: f32) -> f32 {
+    (a - b) * (a - b)
 }

@@ -4,14 +4,16 @@
 //! because it overflows after a change. Two additions are switches: (10) evaluated once more with the uncertainty after
 //! the observation, for tau and sigma only; and an unseen pixel that starts at its observation.
 
+use std::f32::consts::LOG2_E;
+
 use crate::{
     config::{Settings, UnseenStart},
-    lanes::{exp, reciprocals},
+    lanes::{exp2, greatest, least, reciprocals},
     model::belief::{Belief, CHANNELS},
 };
 
-/// Where the exponent of (10) is cut off: sigma_p has long reached its upper bound there.
-const EXPONENT_MAX: f32 = 80.0;
+/// Where the exponent of (10), to base 2, is cut off: sigma_p has long reached its upper bound there.
+const EXPONENT_MAX: f32 = 115.0;
 /// An unseen pixel's belief at its observation: settled enough not to be thrown by the next, open enough to follow it.
 const START_ALPHA: f32 = 1.3;
 const START_SIGMA: f32 = 0.8;
@@ -73,8 +75,9 @@ impl UpdateRules {
     /// (10): the uncertainty `beta / alpha` decides how far the expectation may move.
     #[inline(always)]
     pub fn sigma_p(&self, sigma0: f32, uncertainty: f32) -> f32 {
-        let grown = sigma0 * exp((self.xi * uncertainty).min(EXPONENT_MAX));
-        grown.max(self.sigma_min).min(self.sigma_max)
+        // Neither xi nor an uncertainty is negative.
+        let grown = sigma0 * exp2(least(self.xi * LOG2_E * uncertainty, EXPONENT_MAX));
+        least(greatest(grown, self.sigma_min), self.sigma_max)
     }
 
     /// The three channels: prior with alpha0, beta0, tau0, sigma0 and observation -> beta, tau, sigma, (13) to (15).

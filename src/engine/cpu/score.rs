@@ -4,11 +4,11 @@
 use crate::{
     config::UnseenStart,
     isa::for_each_isa,
-    lanes::{LANES, Lanes, Portable, Transpose, bits, members, prefetch},
+    lanes::{LANES, Lanes, Portable, Transpose, bits, load_or, members, prefetch},
     model::belief::{Belief, BeliefLanes, CHANNELS, Record},
     stages::{
         interpolate::prior::{self, PriorRow},
-        surprise::{GammaTerm, P2_MIN, divergence, edge_gradient_row, joint_surprise},
+        surprise::{EdgeWeights, GammaTerm, P2_MIN, divergence, joint_surprise},
         update::{Channels, UpdateRules},
     },
 };
@@ -38,9 +38,23 @@ impl ScoreRules {
     }
 }
 
+/// Planes that a pixel's score depends on, and those of which the pixels around it matter too.
+const OF_A_PIXEL: [usize; 8] = [
+    prior::ALPHA,
+    prior::BETA,
+    prior::BETA + 1,
+    prior::BETA + 2,
+    prior::SIGMA,
+    prior::SIGMA + 1,
+    prior::SIGMA + 2,
+    prior::P2,
+];
+const OF_THOSE_AROUND: [usize; 4] = [prior::TAU, prior::TAU + 1, prior::TAU + 2, prior::COVERAGE];
+
 /// Working memory of one thread.
 #[derive(Default)]
 pub struct ScoreScratch {
+    edge_weights: EdgeWeights,
     edge_gradient: [Vec<f32>; CHANNELS],
 }
 
@@ -85,25 +99,32 @@ fn score_row_kernel<T: Transpose>(
                 below.map(|row| row.plane(plane)),
             )
         };
+        scratch.edge_weights.find(around(prior::COVERAGE));
         for (channel, gradient) in scratch.edge_gradient.iter_mut().enumerate() {
             gradient.resize(width, 0.0);
-            edge_gradient_row(
-                around(prior::TAU + channel),
-                around(prior::COVERAGE),
-                gradient,
-            );
+            let tau = around(prior::TAU + channel);
+            scratch.edge_weights.gradient(tau, gradient);
         }
     }
     for start in (0..width).step_by(LANES) {
         let count = LANES.min(width - start);
+        for plane in OF_A_PIXEL {
+            prefetch(row.data, width * (prior::PLANES + plane) + start);
+        }
+        // Edges are found in the row below already.
+        let around_rows = if widened { 2 } else { 1 };
+        for plane in OF_THOSE_AROUND {
+            let below = around_rows * prior::PLANES;
+            prefetch(row.data, width * (below + plane) + start);
+        }
         for record in (0..LANES).step_by(2) {
             // The next row's, two a line of cache: they are written whole, but lines are fetched first.
             prefetch(posterior, width + start + record);
         }
-        let mut step = Step::load(row, observed, inverse_gain, start, count);
+        let mut step = Step::load(row, observed, inverse_gain, start);
         let mut scored = if widened {
             for (channel, gradient) in scratch.edge_gradient.iter().enumerate() {
-                step.edge[channel] = load(gradient, start, count);
+                step.edge[channel] = load(gradient, start);
             }
             step.score::<true>(rules)
         } else {
@@ -130,17 +151,10 @@ fn score_row_kernel<T: Transpose>(
     }
 }
 
+/// Any value that makes no exception serves beyond the end of a row.
 #[inline(always)]
-fn load(plane: &[f32], start: usize, count: usize) -> Lanes {
-    match plane[start..].first_chunk::<LANES>() {
-        Some(lanes) => *lanes,
-        None => {
-            // The last step of a row: any value that makes no exception serves as padding.
-            let mut lanes = [1.0; LANES];
-            lanes[..count].copy_from_slice(&plane[start..start + count]);
-            lanes
-        }
-    }
+fn load(plane: &[f32], start: usize) -> Lanes {
+    load_or(1.0, &plane[start..])
 }
 
 /// Sixteen pixels on their way through the update.
@@ -167,31 +181,21 @@ struct Scored {
 
 impl Step {
     #[inline(always)]
-    fn load(
-        row: PriorRow,
-        observed: [&[f32]; CHANNELS],
-        inverse_gain: f32,
-        start: usize,
-        count: usize,
-    ) -> Self {
+    fn load(row: PriorRow, observed: [&[f32]; CHANNELS], inverse_gain: f32, start: usize) -> Self {
         let mut step = Self {
-            alpha: load(row.plane(prior::ALPHA), start, count),
-            p2: load(row.plane(prior::P2), start, count),
-            coverage: load(row.plane(prior::COVERAGE), start, count),
+            alpha: load(row.plane(prior::ALPHA), start),
+            p2: load(row.plane(prior::P2), start),
+            coverage: load(row.plane(prior::COVERAGE), start),
             ..Self::default()
         };
         for c in 0..CHANNELS {
-            step.beta[c] = load(row.plane(prior::BETA + c), start, count);
-            step.tau[c] = load(row.plane(prior::TAU + c), start, count);
-            step.sigma[c] = load(row.plane(prior::SIGMA + c), start, count);
-            step.observed[c] = load(observed[c], start, count);
+            step.beta[c] = load(row.plane(prior::BETA + c), start);
+            step.tau[c] = load(row.plane(prior::TAU + c), start);
+            step.sigma[c] = load(row.plane(prior::SIGMA + c), start);
+            step.observed[c] = load(observed[c], start);
             for observed in &mut step.observed[c] {
                 *observed *= inverse_gain;
             }
-        }
-        for plane in 0..prior::TAU2 {
-            // The next row of the same planes.
-            prefetch(row.data, row.width * (prior::PLANES + plane) + start);
         }
         step
     }
@@ -256,16 +260,18 @@ impl Step {
             posterior,
             ..
         } = scored;
-        for lane in 0..LANES {
-            let unseen = self.coverage[lane] == 0.0;
-            surprise[lane] = if unseen { 0.0 } else { surprise[lane] };
-            let starts = unseen & starts;
-            let or = |value: f32, start: f32| if starts { start } else { value };
-            posterior.alpha[lane] = or(posterior.alpha[lane], start.alpha);
-            for c in 0..CHANNELS {
-                posterior.beta[c][lane] = or(posterior.beta[c][lane], start.beta[c]);
-                posterior.tau[c][lane] = or(posterior.tau[c][lane], self.observed[c][lane]);
-                posterior.sigma[c][lane] = or(posterior.sigma[c][lane], start.sigma[c]);
+        if bits(|lane| self.coverage[lane] == 0.0) != 0 {
+            for lane in 0..LANES {
+                let unseen = self.coverage[lane] == 0.0;
+                surprise[lane] = if unseen { 0.0 } else { surprise[lane] };
+                let starts = unseen & starts;
+                let or = |value: f32, start: f32| if starts { start } else { value };
+                posterior.alpha[lane] = or(posterior.alpha[lane], start.alpha);
+                for c in 0..CHANNELS {
+                    posterior.beta[c][lane] = or(posterior.beta[c][lane], start.beta[c]);
+                    posterior.tau[c][lane] = or(posterior.tau[c][lane], self.observed[c][lane]);
+                    posterior.sigma[c][lane] = or(posterior.sigma[c][lane], start.sigma[c]);
+                }
             }
         }
         if !rules.earlier_appearance {
