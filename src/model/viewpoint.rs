@@ -1,6 +1,6 @@
 //! A viewpoint: a stored pose with depth map, mesh and one belief a pixel (the paper's reference parameter image).
 
-use crate::lanes::LANES;
+use crate::lanes::{LANES, greatest, least, load_or};
 
 use super::{
     belief::{Belief, LEVEL_OFFSET, LEVEL_SCALE, Record, f32_from_f16},
@@ -128,14 +128,21 @@ impl Mesh {
         for (row, (nearest_m, farthest_m)) in self.depth_m.chunks_exact(width).zip(ranges) {
             for block in 0..blocks {
                 // Quads need the vertex to their right.
-                let vertices = &row[block * LANES..(block * LANES + LANES + 1).min(width)];
-                let (mut near, mut far) = (f32::INFINITY, 0.0f32);
-                for &z in vertices {
-                    near = near.min(if z > 0.0 { z } else { f32::INFINITY });
-                    far = far.max(z);
+                let vertices = &row[block * LANES..];
+                let beyond = vertices.get(LANES).copied().unwrap_or(0.0);
+                let depth_m = load_or(0.0, vertices);
+                let (mut near, mut far) = ([0.0; LANES], depth_m);
+                for lane in 0..LANES {
+                    near[lane] = given_or_infinite(depth_m[lane]);
                 }
-                nearest_m[block] = near;
-                farthest_m[block] = far;
+                for half in [8, 4, 2, 1] {
+                    for lane in 0..half {
+                        near[lane] = least(near[lane], near[lane + half]);
+                        far[lane] = greatest(far[lane], far[lane + half]);
+                    }
+                }
+                nearest_m[block] = least(near[0], given_or_infinite(beyond));
+                farthest_m[block] = greatest(far[0], beyond);
             }
         }
     }
@@ -182,6 +189,15 @@ impl Mesh {
             + size_of_val(self.block_nearest_m.as_slice())
             + size_of_val(self.block_farthest_m.as_slice())
             + self.patches.capacity() * size_of::<Patch>()
+    }
+}
+
+#[inline(always)]
+fn given_or_infinite(depth_m: f32) -> f32 {
+    if depth_m > 0.0 {
+        depth_m
+    } else {
+        f32::INFINITY
     }
 }
 
@@ -268,7 +284,7 @@ fn coarse_depth_row(upper: &[f32], lower: &[f32], cut: MeshCut, coarse: &mut [f3
         for z in [upper[0], upper[1], lower[0], lower[1]] {
             count += if z > 0.0 { 1.0 } else { 0.0 };
             sum += z;
-            near = near.min(if z > 0.0 { z } else { f32::INFINITY });
+            near = near.min(given_or_infinite(z));
             far = far.max(z);
         }
         let joined = (count >= COARSE_DEPTHS_MIN) & cut.joins(near, far);
