@@ -8,7 +8,7 @@ use std::ops::Range;
 
 use crate::{
     isa::{Isa, for_each_isa},
-    lanes::{LANES, Lanes, bits, members},
+    lanes::{LANES, Lanes},
     model::camera::Intrinsics,
 };
 
@@ -27,8 +27,8 @@ pub type NormalSums = [f64; HESSIAN + 8];
 /// Steps of sixteen pixels that are added up in single precision.
 const STEPS_MAX: usize = 64;
 
-/// Bins of a histogram over magnitudes: 64 to an octave, so that few values share one with the middle; the first and the
-/// last are open. One more is for NaN, which is no magnitude.
+/// Bins of a histogram over magnitudes: 64 to an octave; the first and the last are open. One more is for NaN, which is no
+/// magnitude.
 const BINS: usize = 24 * 64;
 const BIN_SHIFT: u32 = f32::MANTISSA_DIGITS - 1 - 6;
 /// Of the first: magnitudes of 2^-12.
@@ -79,6 +79,14 @@ struct Points {
     inverse_sd: Vec<f32>,
 }
 
+/// How far some points are from what was predicted.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Mismatch {
+    pub compared: usize,
+    /// Of capped residuals' magnitudes, predicted standard deviations.
+    pub sum: f64,
+}
+
 pub struct Band {
     pub rows: Range<usize>,
     pub predict: PredictScratch,
@@ -86,10 +94,8 @@ pub struct Band {
     /// What the middle is sought of; NaN does not count. In comparisons residuals, predicted standard deviations.
     values: Vec<f32>,
     histogram: Vec<u32>,
-    /// The values of the bin that the middle falls into.
-    members: Vec<f32>,
     sums: NormalSums,
-    mismatch: f64,
+    mismatches: [Mismatch; 2],
 }
 
 impl Default for Band {
@@ -100,9 +106,8 @@ impl Default for Band {
             points: Points::default(),
             values: Vec::new(),
             histogram: Vec::new(),
-            members: Vec::new(),
             sums: [0.0; HESSIAN + 8],
-            mismatch: 0.0,
+            mismatches: Default::default(),
         }
     }
 }
@@ -156,30 +161,24 @@ impl Band {
         &self.sums
     }
 
-    /// Adds up the capped residuals' magnitudes.
-    pub fn judge(&mut self) {
-        let counted = self.values.iter().filter(|value| !value.is_nan());
-        self.mismatch = counted
-            .map(|value| f64::from(value.abs().min(RESIDUAL_CAP)))
-            .sum();
+    /// How well two estimates explain the points.
+    pub fn judge(&mut self, isa: Isa, view: &LevelView, motions: &[Motion; 2]) {
+        for (index, motion) in motions.iter().enumerate() {
+            compare(isa, self, view, motion);
+            let mut mismatch = Mismatch::default();
+            judge(isa, &self.values, &mut mismatch);
+            self.mismatches[index] = mismatch;
+        }
     }
 
-    pub fn mismatch(&self) -> f64 {
-        self.mismatch
-    }
-
-    /// Keeps the values of one bin apart.
-    pub fn pick(&mut self, isa: Isa, bin: usize) {
-        pick(isa, self, bin);
-    }
-
-    pub fn members(&self) -> &[f32] {
-        &self.members
+    pub fn mismatches(&self) -> &[Mismatch; 2] {
+        &self.mismatches
     }
 }
 
-/// How many values all bands hold, and the bin and the rank in it of the middle magnitude.
-pub fn middle_bin(bands: &[Band]) -> (usize, Option<(usize, usize)>) {
+/// How many values all bands hold, and the magnitude with as many below as above, as if those that share its bin were
+/// spread evenly in it; 0 of none.
+pub fn middle(bands: &[Band]) -> (usize, f32) {
     let mut histogram = [0u32; BINS];
     for band in bands {
         // Without the last, for NaN.
@@ -188,15 +187,17 @@ pub fn middle_bin(bands: &[Band]) -> (usize, Option<(usize, usize)>) {
         }
     }
     let count = histogram.iter().sum::<u32>() as usize;
-    let mut rank = count / 2;
+    let mut rank = count as f32 / 2.0;
     for (bin, &members) in histogram.iter().enumerate() {
-        let members = members as usize;
+        let members = members as f32;
         if rank < members {
-            return (count, Some((bin, rank)));
+            let [low, high] =
+                [bin, bin + 1].map(|bin| f32::from_bits((bin as u32 + FIRST_BIN) << BIN_SHIFT));
+            return (count, low + (high - low) * (rank / members));
         }
         rank -= members;
     }
-    (count, None)
+    (count, 0.0)
 }
 
 #[inline(always)]
@@ -233,9 +234,6 @@ for_each_isa! {
 fn count_kernel(band: &mut Band) {
     band.histogram.clear();
     band.histogram.resize(BINS + 1, 0);
-    // As many as there can be, so that no frame allocates.
-    band.members.clear();
-    band.members.reserve(band.values.len());
     for values in band.values.chunks(LANES) {
         for bin in sixteen_bins(values) {
             band.histogram[bin as usize] += 1;
@@ -244,16 +242,39 @@ fn count_kernel(band: &mut Band) {
 }
 
 for_each_isa! {
-    fn pick(band: &mut Band, wanted: usize) = pick_kernel;
+    fn judge(values: &[f32], mismatch: &mut Mismatch) = judge_kernel;
 }
 
 #[inline(always)]
-fn pick_kernel(band: &mut Band, wanted: usize) {
-    for values in band.values.chunks(LANES) {
-        let bins = sixteen_bins(values);
-        for lane in members(bits(|lane| bins[lane] == wanted as u32)) {
-            band.members.push(values[lane].abs());
+fn judge_kernel(values: &[f32], mismatch: &mut Mismatch) {
+    let (mut compared, mut sum) = ([0u32; LANES], [0.0f32; LANES]);
+    for (step, values) in values.as_chunks::<LANES>().0.iter().enumerate() {
+        for lane in 0..LANES {
+            let magnitude = values[lane].abs();
+            let capped = if magnitude < RESIDUAL_CAP {
+                magnitude
+            } else {
+                RESIDUAL_CAP
+            };
+            let counts = !values[lane].is_nan();
+            compared[lane] += u32::from(counts);
+            sum[lane] += if counts { capped } else { 0.0 };
         }
+        if (step + 1) % STEPS_MAX == 0 {
+            mismatch.add(&mut compared, &mut sum);
+        }
+    }
+    mismatch.add(&mut compared, &mut sum);
+}
+
+impl Mismatch {
+    /// Single precision within some steps, double across, as with the normal equations.
+    #[inline(always)]
+    fn add(&mut self, compared: &mut [u32; LANES], sum: &mut Lanes) {
+        self.compared += compared.iter().sum::<u32>() as usize;
+        self.sum += sum.iter().map(|&value| f64::from(value)).sum::<f64>();
+        *compared = [0; LANES];
+        *sum = [0.0; LANES];
     }
 }
 
@@ -368,22 +389,21 @@ fn compare_kernel(band: &mut Band, view: &LevelView, motion: &Motion) {
                 pixel[lane] = row as u32 * width as u32 + column as u32;
                 inside[lane] = u32::from(is_inside);
             }
-            let mut four = [[0.0f32; LANES]; 4];
+            // Two neighbours a load.
+            let mut pairs = [[[0.0f32; 2]; LANES]; 2];
             for lane in 0..LANES {
                 let pixel = pixel[lane] as usize;
                 // SAFETY: the column is below `width - 1` and the row below `height - 1`, or both are 0; the image has
-                // `width * height` values, at least 2x2.
+                // `width * height` values, at least 2x2. An array of `f32` needs no more alignment than one does.
                 unsafe {
-                    four[0][lane] = *observed.get_unchecked(pixel);
-                    four[1][lane] = *observed.get_unchecked(pixel + 1);
-                    four[2][lane] = *observed.get_unchecked(pixel + width);
-                    four[3][lane] = *observed.get_unchecked(pixel + width + 1);
+                    pairs[0][lane] = *observed.as_ptr().add(pixel).cast();
+                    pairs[1][lane] = *observed.as_ptr().add(pixel + width).cast();
                 }
             }
             for lane in 0..LANES {
                 let (right, down) = (to_right[lane], to_below[lane]);
-                let upper = four[0][lane] * (1.0 - right) + four[1][lane] * right;
-                let lower = four[2][lane] * (1.0 - right) + four[3][lane] * right;
+                let [upper, lower] = [0, 1]
+                    .map(|row| pairs[row][lane][0] * (1.0 - right) + pairs[row][lane][1] * right);
                 let observed = upper * (1.0 - down) + lower * down;
                 let residual = observed - motion.gain * luminance[lane] - motion.offset;
                 let normalised = residual * inverse_sd[at][lane];

@@ -26,7 +26,7 @@ use crate::{
     stages::interpolate::project::{Projector, Reach},
 };
 
-use band::{Band, HESSIAN, LevelView, Motion, Tukey, band_rows, divide, middle_bin};
+use band::{Band, HESSIAN, LevelView, Mismatch, Motion, Tukey, band_rows, divide, middle};
 use level::{Level, LevelRows, halve, halve_level};
 
 /// Three views predict as well as seven, at less than half the cost.
@@ -50,6 +50,9 @@ const NORMAL_FROM_MEDIAN: f32 = 1.4826;
 const SCALE_MIN: f32 = 0.1;
 const SCALE_MAX: f32 = 3.0;
 pub const ITERATIONS: usize = 4;
+/// A step below this share of the least standard deviations that are believed is the last of its level: some hundredths
+/// of its pixels, and those after it are shorter still.
+const SETTLED: f64 = 0.01;
 /// A correction beyond this many standard deviations of the stated noise is refused. 6 makes frames flash.
 const CORRECTION_SD_MAX: f64 = 20.0;
 /// Mean of what counts from which the image shows another scene: half of it fits nothing that is expected. Gain and
@@ -140,6 +143,36 @@ struct Estimate {
     offset: f64,
 }
 
+impl Estimate {
+    fn motion(&self) -> Motion {
+        let real_from_given = self.given_from_real.inverse();
+        let rotation = real_from_given.rotation.to_rotation_matrix();
+        Motion {
+            rotation: rotation.matrix().cast::<f32>().into(),
+            translation: real_from_given.translation.vector.cast::<f32>().into(),
+            gain: self.gain as f32,
+            offset: self.offset as f32,
+        }
+    }
+
+    /// One step of Gauss-Newton, and whether it matters on a level.
+    fn moved(&self, d: &Vector8, level: usize) -> (Self, bool) {
+        let (m, rad) = (POSITION_SD_MIN_M, ROTATION_SD_MIN_RAD);
+        let settled = SETTLED * f64::from(1 << level);
+        let matters = [m, m, m, rad, rad, rad, GAIN_SD, OFFSET_SD]
+            .into_iter()
+            .zip(d)
+            .any(|(sd, d)| d.abs() > settled * sd);
+        // The template moved by d: the real camera sees its point X at (exp(d) E)^-1 X.
+        let moved = Self {
+            given_from_real: exponential(d) * self.given_from_real,
+            gain: self.gain + d[6],
+            offset: self.offset + d[7],
+        };
+        (moved, matters)
+    }
+}
+
 /// Keeps its working memory between frames.
 pub struct PoseRefiner {
     isa: Isa,
@@ -155,7 +188,6 @@ struct Work {
     bands: Vec<Band>,
     /// As [`LevelView`] has it.
     along: Vec<f32>,
-    members: Vec<f32>,
 }
 
 /// Fewer bands are done sooner than they are shared out.
@@ -182,23 +214,6 @@ impl Crew {
         } else {
             bands.par_iter_mut().with_max_len(1).map(work).sum()
         }
-    }
-
-    /// Of the magnitudes that the bands hold: how many they are, and the one with as many below as above. Two passes over
-    /// the bits find the same as sorting would; 0 of none.
-    fn middle(self, bands: &mut [Band], members: &mut Vec<f32>) -> (usize, f32) {
-        let (count, Some((bin, rank))) = middle_bin(bands) else {
-            return (0, 0.0);
-        };
-        members.clear();
-        // As many as there can be, so that no frame allocates.
-        members.reserve(count);
-        for band in bands {
-            band.pick(self.isa, bin);
-            members.extend_from_slice(band.members());
-        }
-        let (_, middle, _) = members.select_nth_unstable_by(rank, f32::total_cmp);
-        (count, *middle)
     }
 }
 
@@ -270,7 +285,7 @@ impl Work {
         }
         self.pyramid.resize_with(LEVELS_MAX, Default::default);
         self.predict(crew, question);
-        let levels = self.level_count(crew, question)?;
+        let levels = self.level_count(question)?;
         for coarser in 1..levels {
             let (finer, rest) = self.pyramid.split_at_mut(coarser);
             let (camera, level) = &finer[coarser - 1];
@@ -298,29 +313,31 @@ impl Work {
                 camera,
                 along: &self.along,
             };
-            let bands = divide(&mut self.bands, level.width, level.height);
-            if crew.sum(bands, |band| band.collect(crew.isa, &view)) < PIXELS_MIN {
-                continue;
-            }
             let mut comparison = Comparison {
                 crew,
                 view,
-                bands,
-                members: &mut self.members,
+                bands: divide(&mut self.bands, level.width, level.height),
             };
+            if comparison.begin(&estimate) < PIXELS_MIN {
+                continue;
+            }
             let discount = discount(question.intrinsics.pixels(), index);
-            for _ in 0..ITERATIONS {
-                let Some(next) = comparison.step(&estimate, noise, discount) else {
+            for iteration in 1..=ITERATIONS {
+                let Some(d) = comparison.step(&estimate, noise, discount) else {
                     break;
                 };
+                let (next, matters) = estimate.moved(&d, index);
                 estimate = next;
+                if !matters || iteration == ITERATIONS {
+                    break;
+                }
+                comparison.compare(&estimate);
             }
             if index == 0 {
-                let before = comparison.mismatch(&start);
-                mismatches = Some((before, comparison.mismatch(&estimate)));
+                mismatches = Some(comparison.mismatches([&start, &estimate]));
             }
         }
-        let (before, after) = mismatches?;
+        let [before, after] = mismatches?;
         accepted(
             question.world_from_camera,
             &estimate.given_from_real,
@@ -409,10 +426,10 @@ impl Work {
     }
 
     /// How many levels catch the expected error; `None` when nothing is predicted.
-    fn level_count(&mut self, crew: Crew, question: &Question) -> Option<usize> {
+    fn level_count(&mut self, question: &Question) -> Option<usize> {
         let Level { width, height, .. } = self.pyramid[0].1;
         let bands = divide(&mut self.bands, width, height);
-        let (count, median_m) = crew.middle(bands, &mut self.members);
+        let (count, median_m) = middle(bands);
         if count < PIXELS_MIN {
             return None;
         }
@@ -431,14 +448,23 @@ struct Comparison<'a> {
     crew: Crew,
     view: LevelView<'a>,
     bands: &'a mut [Band],
-    members: &'a mut Vec<f32>,
 }
 
 impl Comparison<'_> {
-    /// One Gauss-Newton step; `None` when too little of the view is left.
-    fn step(&mut self, estimate: &Estimate, noise: PoseNoise, discount: f64) -> Option<Estimate> {
-        self.compare(estimate);
-        let (compared, median) = self.crew.middle(self.bands, self.members);
+    /// Collects the points and compares them with an estimate; returns how many they are.
+    fn begin(&mut self, estimate: &Estimate) -> usize {
+        let (isa, view, motion) = (self.crew.isa, &self.view, estimate.motion());
+        self.crew.sum(self.bands, |band| {
+            let comparable = band.collect(isa, view);
+            band.compare(isa, view, &motion);
+            comparable
+        })
+    }
+
+    /// One Gauss-Newton step from an estimate that the points were compared with: how the template moves, and gain and
+    /// offset change. `None` when too little of the view is left.
+    fn step(&mut self, estimate: &Estimate, noise: PoseNoise, discount: f64) -> Option<Vector8> {
+        let (compared, median) = middle(self.bands);
         if compared < PIXELS_MIN {
             return None;
         }
@@ -478,41 +504,34 @@ impl Comparison<'_> {
             normal[(axis, axis)] += precision;
             right[axis] -= precision * deviation;
         }
-        let d = normal.cholesky()?.solve(&right);
-        // The template moved by d: the real camera sees its point X at (exp(d) E)^-1 X.
-        Some(Estimate {
-            given_from_real: exponential(&d) * estimate.given_from_real,
-            gain: estimate.gain + d[6],
-            offset: estimate.offset + d[7],
-        })
+        Some(normal.cholesky()?.solve(&right))
     }
 
     /// Residuals of all points.
     fn compare(&mut self, estimate: &Estimate) {
-        let real_from_given = estimate.given_from_real.inverse();
-        let rotation = real_from_given.rotation.to_rotation_matrix();
-        let motion = Motion {
-            rotation: rotation.matrix().cast::<f32>().into(),
-            translation: real_from_given.translation.vector.cast::<f32>().into(),
-            gain: estimate.gain as f32,
-            offset: estimate.offset as f32,
-        };
-        let (isa, view) = (self.crew.isa, &self.view);
+        let (isa, view, motion) = (self.crew.isa, &self.view, estimate.motion());
         self.crew
             .each(self.bands, |band| band.compare(isa, view, &motion));
     }
 
-    /// Mean capped residual, predicted standard deviations.
-    fn mismatch(&mut self, estimate: &Estimate) -> f64 {
-        self.compare(estimate);
-        self.crew.each(self.bands, Band::judge);
-        let (compared, _) = middle_bin(self.bands);
-        let sum: f64 = self.bands.iter().map(Band::mismatch).sum();
-        if compared == 0 {
-            f64::INFINITY
-        } else {
-            sum / compared as f64
-        }
+    /// Mean capped residuals of two estimates, predicted standard deviations.
+    fn mismatches(&mut self, estimates: [&Estimate; 2]) -> [f64; 2] {
+        let (isa, view) = (self.crew.isa, &self.view);
+        let motions = estimates.map(Estimate::motion);
+        self.crew
+            .each(self.bands, |band| band.judge(isa, view, &motions));
+        [0, 1].map(|index| {
+            let of_bands = self.bands.iter().map(|band| band.mismatches()[index]);
+            let all = of_bands.fold(Mismatch::default(), |all, band| Mismatch {
+                compared: all.compared + band.compared,
+                sum: all.sum + band.sum,
+            });
+            if all.compared == 0 {
+                f64::INFINITY
+            } else {
+                all.sum / all.compared as f64
+            }
+        })
     }
 }
 
