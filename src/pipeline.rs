@@ -75,8 +75,8 @@ pub enum Stage {
     Remember,
 }
 
-/// Called when a stage has ended.
-type Ended<'a> = &'a mut dyn FnMut(Stage);
+/// Called when a stage has ended, on any thread.
+type Ended<'a> = &'a mut (dyn FnMut(Stage) + Send);
 
 /// What a place knows about one camera.
 #[derive(Debug, Clone, Default)]

@@ -170,7 +170,7 @@ impl Engine {
         evidence: Evidence,
         learn: bool,
         mut answer: Answer<'_>,
-        refined: &mut dyn FnMut(),
+        refined: &mut (dyn FnMut() + Send),
     ) -> Result<Compared, EngineError> {
         let gpu = match self {
             Self::Cpu(engine) => {
@@ -327,7 +327,7 @@ fn compare_on_processor(
     question: &Question,
     evidence: Evidence,
     answer: &mut Answer,
-    between: &mut dyn FnMut(),
+    between: &mut (dyn FnMut() + Send),
 ) -> Compared {
     let Answer {
         prior,
@@ -338,19 +338,22 @@ fn compare_on_processor(
     } = answer;
     let (refined, seen) = observed(engine, question, |observation| {
         let given = Refined::unchanged(*question.world_from_camera);
-        let refined = question.noise.map_or(given, |noise| {
-            refine_on_processor(question, noise, observation, refiner)
-        });
-        between();
-        let seen = engine.compare(
-            question.views,
-            question.intrinsics,
-            &refined.world_from_camera,
-            observation,
-            prior,
-            score,
-        );
-        (refined, seen)
+        // Handed over once for both.
+        engine.in_pool(|| {
+            let refined = question.noise.map_or(given, |noise| {
+                refine_on_processor(question, noise, observation, refiner)
+            });
+            between();
+            let seen = engine.compare(
+                question.views,
+                question.intrinsics,
+                &refined.world_from_camera,
+                observation,
+                prior,
+                score,
+            );
+            (refined, seen)
+        })
     });
     found.find(&score.surprise, prior.width, evidence, blocks);
     Compared {

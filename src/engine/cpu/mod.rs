@@ -261,6 +261,7 @@ impl CpuEngine {
             self.pool.install(|| {
                 data.par_chunks_mut(strip_values)
                     .enumerate()
+                    .with_max_len(1)
                     .for_each(recall);
             });
         }
@@ -310,11 +311,13 @@ impl CpuEngine {
             seen
         };
         let (surprise, posterior) = (&mut score.surprise, &mut score.posterior);
+        // From the end: what was recalled last is nearest at hand.
         if self.is_alone() {
             surprise
                 .chunks_mut(strip_pixels)
                 .zip(posterior.chunks_mut(strip_pixels))
                 .enumerate()
+                .rev()
                 .map(update)
                 .sum()
         } else {
@@ -323,6 +326,8 @@ impl CpuEngine {
                     .par_chunks_mut(strip_pixels)
                     .zip(posterior.par_chunks_mut(strip_pixels))
                     .enumerate()
+                    .rev()
+                    .with_max_len(1)
                     .map(update)
                     .sum()
             })
@@ -339,7 +344,7 @@ impl CpuEngine {
         prior: &mut Prior,
         score: &mut Score,
     ) -> usize {
-        let mut compare = || {
+        self.in_pool(|| {
             self.compare_here(
                 views,
                 intrinsics,
@@ -348,13 +353,7 @@ impl CpuEngine {
                 prior,
                 score,
             )
-        };
-        // Handed over once for all passes.
-        if self.is_alone() {
-            compare()
-        } else {
-            self.pool.install(compare)
-        }
+        })
     }
 
     fn compare_here(
@@ -442,6 +441,7 @@ impl CpuEngine {
                     .zip(surprise.par_chunks_mut(strip_pixels))
                     .zip(posterior.par_chunks_mut(strip_pixels))
                     .enumerate()
+                    .with_max_len(1)
                     .map(both)
                     .sum()
             })
@@ -484,6 +484,15 @@ impl CpuEngine {
         self.reaches
             .lock()
             .expect("never held by a panicked caller")
+    }
+
+    /// Several passes, handed over once.
+    pub fn in_pool<T: Send>(&self, passes: impl FnOnce() -> T + Send) -> T {
+        if self.is_alone() {
+            passes()
+        } else {
+            self.pool.install(passes)
+        }
     }
 
     /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
