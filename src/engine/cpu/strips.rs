@@ -5,7 +5,7 @@ use crate::{
     model::viewpoint::VIEWS_MAX,
     stages::interpolate::{
         gather::Portable,
-        merge::{MergeRules, MergeView, merge_row},
+        merge::{MergeRules, MergeScratch, MergeView, merge_row},
         prior::PLANES,
         project::{ProjectScratch, Projector, Sample, draw, map_size},
     },
@@ -21,6 +21,7 @@ for_each_isa! {
         rules: MergeRules,
         width: usize,
         row: &mut [f32],
+        scratch: &mut MergeScratch,
     ) = merge_row::<Portable>, avx merge_row::<Avx>;
 }
 
@@ -30,6 +31,7 @@ pub struct StripScratch {
     /// One map a view.
     maps: Vec<Sample>,
     project: ProjectScratch,
+    merge: MergeScratch,
 }
 
 impl StripScratch {
@@ -67,7 +69,8 @@ impl StripScratch {
             for (slot, map) in maps.iter_mut().zip(self.maps.chunks_exact(map_size)) {
                 *slot = &map[y * width..][..width];
             }
-            merge(isa, views, &maps[..views.len()], rules, width, row);
+            let scratch = &mut self.merge;
+            merge(isa, views, &maps[..views.len()], rules, width, row, scratch);
         }
     }
 }

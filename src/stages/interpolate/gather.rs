@@ -13,18 +13,22 @@ use super::project::{STEPS, Sample, split};
 
 /// Steps of a source pixel, as integers.
 const WHOLE: u32 = STEPS as u32;
+/// So that a view of [`super::project::SIDE_MAX`] squared is addressed with 32 bits.
+const RECORD_BYTES: u32 = size_of::<Record>() as u32;
 /// Units of [`Sums`]' levels per grey level: weights count [`STEPS`], so that the sum over a triangle is exact.
 pub const LEVEL_UNITS: f32 = LEVEL_SCALE * STEPS;
 
 /// Where sixteen pixels come from in one view. Indices lie inside the view, whatever the samples.
 #[derive(Clone, Copy)]
+#[repr(align(64))]
 pub struct Source {
+    /// In bytes from the view's first record, as all that follow.
     upper_left: [u32; LANES],
     /// Upper left or lower right, whichever belongs to the triangle.
     corner: [u32; LANES],
-    /// Of the corner, the upper right and the lower left record; 0 where unseen.
+    /// Of the corner, the upper right and the lower left record, times the view's; 0 where unseen.
     pub weights: [Lanes; 3],
-    /// The same in [`STEPS`]; two of them in one word, the first below.
+    /// The same in [`STEPS`], without the view's; two of them in one word, the first below.
     corner_and_right: [u32; LANES],
     lower_left: [u32; LANES],
     /// 1/metres; 0 where unseen.
@@ -41,9 +45,14 @@ impl Source {
         inverse_depth: [0.0; LANES],
     };
 
-    /// Sixteen pixels, of a view of `width * height` pixels, at least 2x2.
+    /// Sixteen pixels, of a view of `width * height` pixels, at least 2x2, that weighs so much.
     #[inline(always)]
-    pub fn locate(&mut self, samples: &[Sample; LANES], width: u32, height: u32) {
+    pub fn locate(
+        &mut self,
+        samples: &[Sample; LANES],
+        (width, height): (u32, u32),
+        view_weight: f32,
+    ) {
         // In halves first, so that all that follows is done sixteen at a time.
         let (mut lows, mut highs) = ([0u32; LANES], [0u32; LANES]);
         for lane in 0..LANES {
@@ -60,21 +69,23 @@ impl Source {
             let upper_left = row * width + column;
             let in_lower_right = right + down > WHOLE;
             let corner = upper_left + if in_lower_right { width + 1 } else { 0 };
+            // Where unseen, right and down are 0.
+            let whole = if inverse_depth > 0.0 { WHOLE } else { 0 };
             let w = [
                 if in_lower_right {
                     right + down - WHOLE
                 } else {
-                    WHOLE - (right + down)
+                    whole - (right + down)
                 },
                 if in_lower_right { WHOLE - down } else { right },
                 if in_lower_right { WHOLE - right } else { down },
             ];
-            self.upper_left[lane] = upper_left;
-            self.corner[lane] = corner;
+            self.upper_left[lane] = upper_left * RECORD_BYTES;
+            self.corner[lane] = corner * RECORD_BYTES;
             self.corner_and_right[lane] = w[0] | (w[1] << 16);
             self.lower_left[lane] = w[2];
             for (weights, w) in self.weights.iter_mut().zip(w) {
-                weights[lane] = w as i32 as f32 * (1.0 / STEPS);
+                weights[lane] = w as i32 as f32 * (1.0 / STEPS) * view_weight;
             }
             self.inverse_depth[lane] = inverse_depth;
         }
@@ -89,12 +100,22 @@ impl Source {
     /// Where they lie in a view so wide.
     #[inline(always)]
     pub fn corners(&self, lane: usize, width: usize) -> [usize; 3] {
-        let upper_left = self.upper_left[lane] as usize;
-        [
-            self.corner[lane] as usize,
-            upper_left + 1,
-            upper_left + width,
-        ]
+        let index = |bytes: u32| (bytes / RECORD_BYTES) as usize;
+        let upper_left = index(self.upper_left[lane]);
+        [index(self.corner[lane]), upper_left + 1, upper_left + width]
+    }
+
+    /// Of a lane's records within their triangle; together 1 where it is seen.
+    #[inline(always)]
+    pub fn shares(&self, lane: usize) -> [f32; 3] {
+        self.steps(lane).map(|w| w as f32 * (1.0 / STEPS))
+    }
+
+    /// The same in [`STEPS`].
+    #[inline(always)]
+    fn steps(&self, lane: usize) -> [i32; 3] {
+        let w = self.corner_and_right[lane];
+        [w & 0xffff, w >> 16, self.lower_left[lane]].map(|w| w as i32)
     }
 }
 
@@ -109,12 +130,16 @@ pub struct GatherView<'a> {
 /// Asks for what the row below will need: of its three records two are near those of this row. One at a time, between
 /// other work: only so many may be on their way at once, and who asks for one more waits.
 #[inline(always)]
-fn prefetch_below(view: &GatherView, upper_left: usize) {
-    prefetch(view.records, upper_left + 2 * view.width);
+fn prefetch_below(view: &GatherView, upper_left: u32) {
+    prefetch(
+        bytemuck::cast_slice::<_, u8>(view.records),
+        upper_left as usize + 2 * view.width * RECORD_BYTES as usize,
+    );
 }
 
 /// Sums of sixteen pixels over views, as planes.
 #[derive(Clone, Copy)]
+#[repr(align(64))]
 pub struct Sums {
     /// Weighted spread: alpha, beta, sigma, p2.
     pub spread: [Lanes; 8],
@@ -133,12 +158,17 @@ impl Sums {
     };
 }
 
-/// The sums of one pixel, interleaved.
-type Tile = [[f32; 8]; LANES];
+/// The sums of sixteen pixels, each interleaved.
+#[repr(align(64))]
+struct Tile([[f32; 8]; LANES]);
 
-#[inline(always)]
-fn planes<T: Transpose>(tile: &Tile, planes: &mut [Lanes; 8]) {
-    T::planes(bytemuck::cast_ref(tile), bytemuck::cast_mut(planes));
+impl Tile {
+    const ZERO: Self = Self([[0.0; 8]; LANES]);
+
+    #[inline(always)]
+    fn planes<T: Transpose>(&self, planes: &mut [Lanes; 8]) {
+        T::planes(bytemuck::cast_ref(&self.0), bytemuck::cast_mut(planes));
+    }
 }
 
 /// The two twins.
@@ -167,11 +197,11 @@ impl Gather for Portable {
         seen: &[u32; LANES],
         sums: &mut Sums,
     ) {
-        let mut spreads: Tile = [[0.0; 8]; LANES];
-        let mut levels: Tile = [[0.0; 8]; LANES];
-        let mut ranges: Tile = [[0.0; 8]; LANES];
+        let mut spreads = Tile::ZERO;
+        let mut levels = Tile::ZERO;
+        let mut ranges = Tile::ZERO;
         for lane in 0..LANES {
-            let spread = &mut spreads[lane];
+            let spread = &mut spreads.0[lane];
             // At most 16 views of 2^15 * 2^7: no overflow.
             let mut whole = [0i32; 4];
             let (mut sum, mut square) = ([0.0f32; 4], [0.0f32; 4]);
@@ -181,19 +211,18 @@ impl Gather for Portable {
             for index in members(seen[lane]) {
                 let source = &sources[index];
                 let records = source.records(lane, &views[index]);
-                prefetch_below(&views[index], source.upper_left[lane] as usize);
+                prefetch_below(&views[index], source.upper_left[lane]);
                 let weight = views[index].weight;
                 for (record, weights) in records.into_iter().zip(&source.weights) {
-                    let w = weights[lane] * weight;
+                    let w = weights[lane];
                     for (spread, stored) in spread.iter_mut().zip(record.spread) {
                         *spread += w * f32_from_f16(stored);
                     }
                 }
-                let w = source.corner_and_right[lane];
-                let w = [w & 0xffff, w >> 16, source.lower_left[lane]];
+                let w = source.steps(lane);
                 let level: [i32; 4] = std::array::from_fn(|channel| {
                     (0..3)
-                        .map(|corner| i32::from(records[corner].level[channel]) * w[corner] as i32)
+                        .map(|corner| i32::from(records[corner].level[channel]) * w[corner])
                         .sum()
                 });
                 if !COMPARING {
@@ -216,20 +245,20 @@ impl Gather for Portable {
             if !COMPARING {
                 sum = whole.map(|whole| whole as f32);
             }
-            levels[lane][..4].copy_from_slice(&sum);
+            levels.0[lane][..4].copy_from_slice(&sum);
             if COMPARING {
-                levels[lane][4..].copy_from_slice(&square);
-                ranges[lane][..4].copy_from_slice(&first.unwrap_or_default());
+                levels.0[lane][4..].copy_from_slice(&square);
+                ranges.0[lane][..4].copy_from_slice(&first.unwrap_or_default());
                 for channel in 0..4 {
-                    ranges[lane][4 + channel] = high[channel] - low[channel];
+                    ranges.0[lane][4 + channel] = high[channel] - low[channel];
                 }
             }
         }
         use lanes::Portable;
-        planes::<Portable>(&spreads, &mut sums.spread);
-        planes::<Portable>(&levels, &mut sums.level);
+        spreads.planes::<Portable>(&mut sums.spread);
+        levels.planes::<Portable>(&mut sums.level);
         if COMPARING {
-            planes::<Portable>(&ranges, &mut sums.range);
+            ranges.planes::<Portable>(&mut sums.range);
         }
     }
 }
@@ -243,7 +272,7 @@ mod x86 {
 
     use crate::lanes::members;
 
-    use super::{Gather, GatherView, LANES, Source, Sums, Tile, planes, prefetch_below};
+    use super::{Gather, GatherView, LANES, RECORD_BYTES, Source, Sums, Tile};
 
     /// With AVX2 and F16C.
     pub struct Avx;
@@ -261,6 +290,21 @@ mod x86 {
         }
     }
 
+    /// Pixels side by side: what a view needs is then looked up once for several, and the levels of two share a register.
+    const GROUP: usize = 4;
+
+    /// What is known of the levels of two pixels, four channels each, from the views so far.
+    #[derive(Clone, Copy)]
+    struct Levels {
+        first: __m256,
+        /// All ones once there is a first.
+        has_first: __m256,
+        sum: __m256,
+        square: __m256,
+        low: __m256,
+        high: __m256,
+    }
+
     /// # Safety
     /// `seen` names views only, each with a source that was located in it, and its records are there.
     #[inline]
@@ -271,89 +315,152 @@ mod x86 {
         seen: &[u32; LANES],
         sums: &mut Sums,
     ) {
-        let zero = _mm_setzero_si128();
-        let mut spreads: Tile = [[0.0; 8]; LANES];
-        let mut levels: Tile = [[0.0; 8]; LANES];
-        let mut ranges: Tile = [[0.0; 8]; LANES];
-        for lane in 0..LANES {
-            let mut spread = _mm256_setzero_ps();
-            let mut whole = zero;
-            let mut sum = _mm_setzero_ps();
-            let mut square = _mm_setzero_ps();
-            let mut first = _mm_setzero_ps();
-            let mut low = _mm_set1_ps(f32::INFINITY);
-            let mut high = _mm_set1_ps(f32::NEG_INFINITY);
-            let mut is_first = true;
-            for index in members(seen[lane]) {
+        let mut spreads = Tile::ZERO;
+        let mut levels = Tile::ZERO;
+        let mut ranges = Tile::ZERO;
+        for lane in (0..LANES).step_by(GROUP) {
+            let group = seen[lane..lane + GROUP]
+                .iter()
+                .fold(0, |all, seen| all | seen);
+            let mut spread = [_mm256_setzero_ps(); GROUP];
+            let mut whole = [_mm256_setzero_si256(); GROUP / 2];
+            let mut compared = [Levels {
+                first: _mm256_setzero_ps(),
+                has_first: _mm256_setzero_ps(),
+                sum: _mm256_setzero_ps(),
+                square: _mm256_setzero_ps(),
+                low: _mm256_set1_ps(f32::INFINITY),
+                high: _mm256_set1_ps(f32::NEG_INFINITY),
+            }; GROUP / 2];
+            for index in members(group) {
                 // SAFETY: `seen` says which of the views, and there is a source for each.
                 let (source, view) =
                     unsafe { (sources.get_unchecked(index), views.get_unchecked(index)) };
-                // SAFETY: sources lie inside their view, which has its records, as `sum` demands; a record is 32 readable
-                // bytes: eight f16, then eight i16.
-                let halves = unsafe {
-                    let upper_left = view.records.as_ptr().add(source.upper_left[lane] as usize);
-                    let corner = view.records.as_ptr().add(source.corner[lane] as usize);
-                    prefetch_below(view, source.upper_left[lane] as usize);
-                    [corner, upper_left.add(1), upper_left.add(view.width)].map(|record| {
-                        (
-                            _mm_load_si128(record.cast()),
-                            _mm_load_si128(record.cast::<__m128i>().add(1)),
-                        )
-                    })
-                };
-                for ((stored, _), weights) in halves.into_iter().zip(&source.weights) {
-                    let w = if COMPARING {
-                        weights[lane] * view.weight
-                    } else {
-                        weights[lane]
-                    };
-                    let w = _mm256_set1_ps(w);
-                    spread = _mm256_add_ps(spread, _mm256_mul_ps(w, _mm256_cvtph_ps(stored)));
-                }
-                let [(_, corner), (_, upper_right), (_, lower_left)] = halves;
-                let two = _mm_madd_epi16(
-                    _mm_unpacklo_epi16(corner, upper_right),
-                    _mm_set1_epi32(source.corner_and_right[lane] as i32),
-                );
-                let one = _mm_madd_epi16(
-                    _mm_unpacklo_epi16(lower_left, zero),
-                    _mm_set1_epi32(source.lower_left[lane] as i32),
-                );
-                let level = _mm_add_epi32(two, one);
-                if COMPARING {
-                    let level = _mm_cvtepi32_ps(level);
-                    if is_first {
-                        first = level;
-                        is_first = false;
+                let row = view.width * RECORD_BYTES as usize;
+                let records = view.records.as_ptr().cast::<u8>();
+                for pair in 0..GROUP / 2 {
+                    let mut upper = [_mm_setzero_si128(); 2];
+                    let mut lower = [_mm_setzero_si128(); 2];
+                    for of_pair in 0..2 {
+                        let in_group = 2 * pair + of_pair;
+                        let lane = lane + in_group;
+                        // SAFETY: sources lie inside their view, which has its records, as `sum` demands, also where
+                        // they weigh nothing; a record is 32 readable bytes: eight f16, then eight i16. A prefetch is of
+                        // any address.
+                        let corners = unsafe {
+                            let upper_left = records.add(source.upper_left[lane] as usize);
+                            _mm_prefetch::<_MM_HINT_T0>(upper_left.wrapping_add(2 * row).cast());
+                            [
+                                records.add(source.corner[lane] as usize),
+                                upper_left.add(RECORD_BYTES as usize),
+                                upper_left.add(row),
+                            ]
+                        };
+                        for (corner, weights) in corners.into_iter().zip(&source.weights) {
+                            // SAFETY: as above.
+                            let stored = unsafe { _mm_load_si128(corner.cast()) };
+                            let w = _mm256_set1_ps(weights[lane]);
+                            spread[in_group] = _mm256_add_ps(
+                                spread[in_group],
+                                _mm256_mul_ps(w, _mm256_cvtph_ps(stored)),
+                            );
+                        }
+                        // SAFETY: as above.
+                        let [corner, right, left] = corners.map(|corner| unsafe {
+                            _mm_load_si128(corner.cast::<__m128i>().add(1))
+                        });
+                        upper[of_pair] = _mm_unpacklo_epi16(corner, right);
+                        lower[of_pair] = _mm_cvtepu16_epi32(left);
                     }
-                    let difference = _mm_sub_ps(level, first);
-                    let weighted = _mm_mul_ps(_mm_set1_ps(view.weight), difference);
-                    sum = _mm_add_ps(sum, weighted);
-                    square = _mm_add_ps(square, _mm_mul_ps(weighted, difference));
-                    low = _mm_min_ps(low, level);
-                    high = _mm_max_ps(high, level);
-                } else {
-                    whole = _mm_add_epi32(whole, level);
+                    let at = lane + 2 * pair;
+                    let level = _mm256_add_epi32(
+                        _mm256_madd_epi16(
+                            _mm256_set_m128i(upper[1], upper[0]),
+                            each_four_times(&source.corner_and_right, at),
+                        ),
+                        _mm256_madd_epi16(
+                            _mm256_set_m128i(lower[1], lower[0]),
+                            each_four_times(&source.lower_left, at),
+                        ),
+                    );
+                    if !COMPARING {
+                        whole[pair] = _mm256_add_epi32(whole[pair], level);
+                        continue;
+                    }
+                    let depth = each_four_times(bytemuck::cast_ref(&source.inverse_depth), at);
+                    let is_seen =
+                        _mm256_castsi256_ps(_mm256_cmpgt_epi32(depth, _mm256_setzero_si256()));
+                    let level = _mm256_cvtepi32_ps(level);
+                    let compared = &mut compared[pair];
+                    let is_first = _mm256_andnot_ps(compared.has_first, is_seen);
+                    compared.first = _mm256_or_ps(compared.first, _mm256_and_ps(is_first, level));
+                    compared.has_first = _mm256_or_ps(compared.has_first, is_seen);
+                    let difference = _mm256_and_ps(is_seen, _mm256_sub_ps(level, compared.first));
+                    let weighted = _mm256_mul_ps(_mm256_set1_ps(view.weight), difference);
+                    compared.sum = _mm256_add_ps(compared.sum, weighted);
+                    compared.square =
+                        _mm256_add_ps(compared.square, _mm256_mul_ps(weighted, difference));
+                    // Of a level that is no number the other is kept.
+                    let level = _mm256_or_ps(
+                        level,
+                        _mm256_xor_ps(is_seen, _mm256_castsi256_ps(_mm256_set1_epi32(-1))),
+                    );
+                    compared.low = _mm256_min_ps(level, compared.low);
+                    compared.high = _mm256_max_ps(level, compared.high);
                 }
             }
-            if !COMPARING {
-                sum = _mm_cvtepi32_ps(whole);
+            for (in_group, spread) in spread.into_iter().enumerate() {
+                store(&mut spreads.0[lane + in_group], spread);
             }
-            // SAFETY: eight f32 each.
-            unsafe {
-                _mm256_storeu_ps(spreads[lane].as_mut_ptr(), spread);
-                _mm256_storeu_ps(levels[lane].as_mut_ptr(), _mm256_set_m128(square, sum));
+            for (pair, (whole, compared)) in whole.into_iter().zip(compared).enumerate() {
+                let at = lane + 2 * pair;
+                let sum = if COMPARING {
+                    compared.sum
+                } else {
+                    _mm256_cvtepi32_ps(whole)
+                };
+                let range = _mm256_sub_ps(compared.high, compared.low);
+                store(
+                    &mut levels.0[at],
+                    _mm256_permute2f128_ps::<0x20>(sum, compared.square),
+                );
+                store(
+                    &mut levels.0[at + 1],
+                    _mm256_permute2f128_ps::<0x31>(sum, compared.square),
+                );
                 if COMPARING {
-                    let range = _mm_sub_ps(high, low);
-                    _mm256_storeu_ps(ranges[lane].as_mut_ptr(), _mm256_set_m128(range, first));
+                    let first = compared.first;
+                    store(
+                        &mut ranges.0[at],
+                        _mm256_permute2f128_ps::<0x20>(first, range),
+                    );
+                    store(
+                        &mut ranges.0[at + 1],
+                        _mm256_permute2f128_ps::<0x31>(first, range),
+                    );
                 }
             }
         }
         use crate::lanes::Avx;
-        planes::<Avx>(&spreads, &mut sums.spread);
-        planes::<Avx>(&levels, &mut sums.level);
+        spreads.planes::<Avx>(&mut sums.spread);
+        levels.planes::<Avx>(&mut sums.level);
         if COMPARING {
-            planes::<Avx>(&ranges, &mut sums.range);
+            ranges.planes::<Avx>(&mut sums.range);
         }
+    }
+
+    /// The words of lanes `at` and `at + 1`.
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn each_four_times(words: &[u32; LANES], at: usize) -> __m256i {
+        let [first, second] = [words[at], words[at + 1]].map(|word| _mm256_set1_epi32(word as i32));
+        _mm256_blend_epi32::<0b1111_0000>(first, second)
+    }
+
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    fn store(row: &mut [f32; 8], value: __m256) {
+        // SAFETY: eight f32.
+        unsafe { _mm256_storeu_ps(row.as_mut_ptr(), value) }
     }
 }

@@ -104,6 +104,25 @@ impl Gathered {
     }
 }
 
+/// Working memory of one thread.
+pub struct MergeScratch {
+    sources: [Source; VIEWS_MAX],
+    sums: Sums,
+    merged: Merged,
+    pixel: Pixel,
+}
+
+impl Default for MergeScratch {
+    fn default() -> Self {
+        Self {
+            sources: [Source::NONE; VIEWS_MAX],
+            sums: Sums::ZERO,
+            merged: Merged([[0.0; LANES]; prior::PLANES]),
+            pixel: Pixel::default(),
+        }
+    }
+}
+
 /// Merges one row of the target. `maps[i]` is the row of the map of `views[i]`; `row` takes [`prior::PLANES`] planes of
 /// `width`.
 #[inline(always)]
@@ -113,6 +132,7 @@ pub fn merge_row<G: Gather>(
     rules: MergeRules,
     width: usize,
     row: &mut [f32],
+    scratch: &mut MergeScratch,
 ) {
     assert!(views.len() <= VIEWS_MAX && views.len() == maps.len());
     for view in views {
@@ -138,9 +158,19 @@ pub fn merge_row<G: Gather>(
         };
     }
     let gather_views = &gather_views[..views.len()];
-    let mut sources = [Source::NONE; VIEWS_MAX];
-    let mut sums = Sums::ZERO;
-    let mut pixel = Pixel::default();
+    let MergeScratch {
+        sources,
+        sums,
+        merged,
+        pixel,
+    } = scratch;
+    for (source, _) in sources
+        .iter_mut()
+        .zip(views)
+        .filter(|(_, view)| !has_triangles(view))
+    {
+        *source = Source::NONE;
+    }
     for start in (0..width).step_by(LANES) {
         let count = LANES.min(width - start);
         let mut step = Step::default();
@@ -155,7 +185,11 @@ pub fn merge_row<G: Gather>(
                     }
                 };
                 let source = &mut sources[index];
-                source.locate(samples, view.width as u32, view.height as u32);
+                source.locate(
+                    samples,
+                    (view.width as u32, view.height as u32),
+                    view.weight,
+                );
                 step.see(index, view.weight, &source.inverse_depth);
                 if rules.depth_vote_tolerance.is_some() {
                     step.range(&source.inverse_depth);
@@ -171,24 +205,24 @@ pub fn merge_row<G: Gather>(
         }
         if comparing {
             // SAFETY: only views that have triangles are seen, all located above; their records were counted.
-            unsafe { G::sum::<true>(gather_views, &sources, &step.seen, &mut sums) };
-            let mut merged = step.finish(&sums, true, rules.view_variance);
+            unsafe { G::sum::<true>(gather_views, sources, &step.seen, sums) };
+            step.finish(sums, true, rules.view_variance, merged);
             if rules.colour_vote {
-                apart |= merged.colours_apart(&sums);
+                apart |= merged.colours_apart(sums);
             }
             if rules.earlier_appearance {
                 apart |= merged.remembering();
             }
-            merged.write(row, width, start, count);
         } else {
             // SAFETY: as above.
-            unsafe { G::sum::<false>(gather_views, &sources, &step.seen, &mut sums) };
-            step.finish(&sums, false, false)
-                .write(row, width, start, count);
+            unsafe { G::sum::<false>(gather_views, sources, &step.seen, sums) };
+            step.finish(sums, false, false, merged);
         }
+        merged.write(row, width, start, count);
         for lane in members(apart).take_while(|&lane| lane < count) {
             pixel.clear();
-            for (view, (gather_view, source)) in views.iter().zip(gather_views.iter().zip(&sources))
+            for (view, (gather_view, source)) in
+                views.iter().zip(gather_views.iter().zip(&*sources))
             {
                 if source.inverse_depth[lane] > 0.0 {
                     pixel.push(
@@ -214,6 +248,7 @@ pub fn merge_row<G: Gather>(
 
 /// What is known of sixteen pixels before their records are fetched.
 #[derive(Default)]
+#[repr(align(64))]
 struct Step {
     /// Views that see a pixel, a bit mask.
     seen: [u32; LANES],
@@ -263,8 +298,7 @@ impl Step {
 
     /// Weighted means of all that was summed; with `view_variance` beta grows by alpha times their variance in tau.
     #[inline(always)]
-    fn finish(&self, sums: &Sums, comparing: bool, view_variance: bool) -> Merged {
-        let mut merged = Merged([[0.0; LANES]; prior::PLANES]);
+    fn finish(&self, sums: &Sums, comparing: bool, view_variance: bool, merged: &mut Merged) {
         let planes = &mut merged.0;
         for lane in 0..LANES {
             let seen = self.coverage[lane] > 0.0;
@@ -295,11 +329,11 @@ impl Step {
             planes[prior::DEPTH][lane] = self.weighted_depth_m[lane] * scale;
             planes[prior::COVERAGE][lane] = self.coverage[lane];
         }
-        merged
     }
 }
 
-/// Sixteen pixels of the prior.
+/// Sixteen pixels of the prior; nothing earlier is remembered yet.
+#[repr(align(64))]
 struct Merged([Lanes; prior::PLANES]);
 
 impl Merged {
@@ -338,7 +372,7 @@ impl Merged {
 #[inline(always)]
 fn interpolate(view: &GatherView, source: &Source, lane: usize) -> Gathered {
     let records = source.records(lane, view);
-    let w = source.weights.map(|weights| weights[lane]);
+    let w = source.shares(lane);
     let mut gathered = Gathered {
         spread: [0.0; 8],
         level: LEVEL_OFFSET,

@@ -171,7 +171,7 @@ impl FlatPatch {
             let slots: &mut [Sample; LANES] = (&mut map[at..at + LANES])
                 .try_into()
                 .expect("sixteen are sixteen");
-            let count = end - at;
+            let count = (end - at) as u32;
             let along = (at - first) as f32;
             let (mut highs, mut lows) = ([0u32; LANES], [0u32; LANES]);
             for lane in 0..LANES {
@@ -188,14 +188,15 @@ impl FlatPatch {
                 let u = (column * STEPS + self.first_column).to_bits() & INTEGER_MASK;
                 let v = (row * STEPS + self.first_row).to_bits() & INTEGER_MASK;
                 let depth = (slopes[3] * x + starts[3]).to_bits() >> INVERSE_DEPTH_SHIFT;
-                highs[lane] = (depth << (2 * POSITION_BITS - 32)) | (v >> (32 - POSITION_BITS));
-                lows[lane] = (v << POSITION_BITS) | u;
+                let high = (depth << (2 * POSITION_BITS - 32)) | (v >> (32 - POSITION_BITS));
+                // Beyond the span nothing is shown.
+                let within = (lane as u32) < count;
+                highs[lane] = if within { high } else { 0 };
+                lows[lane] = if within { (v << POSITION_BITS) | u } else { 0 };
             }
             for lane in 0..LANES {
                 let sample = (u64::from(highs[lane]) << 32) | u64::from(lows[lane]);
-                let sample = if lane < count { sample } else { 0 };
-                let slot = slots[lane];
-                slots[lane] = if sample > slot { sample } else { slot };
+                slots[lane] = slots[lane].max(sample);
             }
         }
     }

@@ -8,7 +8,7 @@ use std::ops::Range;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::isa::{Isa, for_each_isa};
-use crate::lanes::{LANES, Lanes, reciprocal};
+use crate::lanes::{LANES, Lanes, prefetch, reciprocal};
 use crate::model::{
     camera::Intrinsics,
     patch::PATCH_ROWS,
@@ -412,6 +412,10 @@ impl<'a> Projector<'a> {
         let ys = &mut vertices.y[touched.clone()];
         let inverse_depths = &mut vertices.inverse_depth[touched.clone()];
         let first = touched.start as i32;
+        for block in (touched.clone()).step_by(LANES) {
+            // The row below is next.
+            prefetch(&self.mesh.depth_m, (row + 1) * columns + block);
+        }
         for column in 0..depth_m.len() {
             let z = depth_m[column];
             let at = (first + column as i32) as f32;
@@ -419,7 +423,7 @@ impl<'a> Projector<'a> {
             let q_y = z * (m[(1, 0)] * at + start.y) + offset.y;
             let q_z = z * (m[(2, 0)] * at + start.z) + offset.z;
             let drawable = z > 0.0 && q_z >= NEAR_M;
-            let inverse = if drawable { 1.0 / q_z } else { 0.0 };
+            let inverse = if drawable { inverted(q_z) } else { 0.0 };
             xs[column] = (q_x * inverse).clamp(-FAR_PX, FAR_PX);
             ys[column] = (q_y * inverse).clamp(-FAR_PX, FAR_PX);
             inverse_depths[column] = inverse;
@@ -462,6 +466,13 @@ fn draw_kernel(
     scratch: &mut ProjectScratch,
 ) {
     projector.draw(width, rows, map, scratch);
+}
+
+/// 1/x of a positive normal number, to 2e-7 of itself, in less time than a division.
+#[inline(always)]
+fn inverted(x: f32) -> f32 {
+    let r = reciprocal(x);
+    r * (2.0 - x * r)
 }
 
 /// Far outside any image, and small enough for [`floor`].
@@ -631,6 +642,7 @@ fn max(a: f32, b: f32) -> f32 {
 }
 
 /// The corners of sixteen quads: upper left, upper right, lower left, lower right.
+#[repr(align(64))]
 struct Corners {
     x: [Lanes; 4],
     y: [Lanes; 4],
@@ -651,7 +663,9 @@ fn four_corners(upper: &[f32], lower: &[f32], column: usize) -> [Lanes; 4] {
 }
 
 /// Sixteen quads ready to be sampled. Offsets are from the upper right vertex, which both triangles share; `a` is the
-/// vertex that is particular to a triangle: the upper left (index 0) or the lower right one (1).
+/// vertex that is particular to a triangle: the upper left (index 0) or the lower right one (1). Aligned as all that is
+/// written and read sixteen at a time, so that no step crosses a cache line.
+#[repr(align(64))]
 struct Block {
     /// Bounding boxes, pixels; no candidates where nothing can be drawn.
     x_first: [i32; LANES],
@@ -679,6 +693,7 @@ struct Block {
 }
 
 /// What up to four candidates of sixteen quads show.
+#[repr(align(64))]
 struct Batch {
     high: [u32; BATCH * LANES],
     low: [u32; BATCH * LANES],

@@ -144,7 +144,7 @@ impl Seen {
     fn read(&mut self, coarse: &Coarse, samples: &[Sample; LANES], weight: f32) {
         let Intrinsics { width, height, .. } = coarse.mesh.intrinsics;
         let mut source = Source::NONE;
-        source.locate(samples, width as u32, height as u32);
+        source.locate(samples, (width as u32, height as u32), 1.0);
         let mut corners = [[[0.0f32; LANES]; 3]; 2];
         for lane in 0..LANES {
             let at = source.corners(lane, width);
