@@ -1,12 +1,14 @@
 """From published frame to received report, and how many robots a machine sustains.
 
 Needs: pip install -r tests/python/requirements.txt; and `cargo build --release`.
-Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10]`.
+Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10] [--noise 8]`.
 
 Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second each: a JPEG, depth as 16-bit millimetres
-with noise, a pose. First one robot: time from putting a frame to its report, beside the same bytes sent there and back
+with noise, a pose. `--noise` is of the pictures, grey levels: with 8 of them a JPEG of quality 90 is as large as a
+camera's. The messages are made before; while it runs a robot puts a stamp before one and sends it. First one robot: time from putting a frame to its report, beside the same bytes sent there and back
 by a process that does nothing else. Then more and more robots, in as many places as there are cores, each time on a
-fresh service, until a frame has no report. Robots and service share the machine.
+fresh service, until a frame has no report. Robots and service share the machine; processor time is that of all threads,
+of the service and of the robots, after the warm-up.
 
 A Xeon of 2.6 GHz, two cores, nothing else at work, frames of 171 KiB: the echo takes 0.9 ms (99th percentile 8 ms). `robust`: one
 robot's report comes after 14.3 ms (19.4), of sixteen robots after 9.5 ms (41), twenty are too many. `paper`: 13.1 ms (16.3), of
@@ -21,6 +23,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -42,17 +45,19 @@ WARM_UP_S = 3.0
 PATIENCE_S = 3.0
 
 
-def frames() -> list[bytes]:
-    """Frames without stamp and sequence: a camera that moves along a wall."""
+def frames(noise: float) -> tuple[list[bytes], float]:
+    """Frames without stamp and sequence: a camera that moves along a wall. And the mean size of their JPEGs, bytes."""
     rng = np.random.default_rng(1)
     width = WIDTH + SHIFT * FRAMES
     coarse = rng.integers(40, 215, (HEIGHT // 8, width // 8 + 1, 3), np.uint8)
     wall = np.asarray(Picture.fromarray(coarse).resize((width, HEIGHT), Picture.Resampling.BICUBIC))
-    made = []
+    made, jpeg_bytes = [], 0
     for index in range(FRAMES):
         shift = SHIFT * index
+        seen = wall[:, shift : shift + WIDTH] + rng.normal(0.0, noise, (HEIGHT, WIDTH, 3))
         file = io.BytesIO()
-        Picture.fromarray(wall[:, shift : shift + WIDTH]).save(file, "jpeg", quality=90)
+        Picture.fromarray(seen.round().clip(0, 255).astype(np.uint8)).save(file, "jpeg", quality=90)
+        jpeg_bytes += len(file.getvalue())
         depth = rng.normal(1000 * DISTANCE_M, 2.0, (HEIGHT, WIDTH)).round().astype("<u2")
         message = Frame(
             image=Image(encoding="jpeg", width=WIDTH, height=HEIGHT, data=file.getvalue()),
@@ -64,7 +69,35 @@ def frames() -> list[bytes]:
         lens.width, lens.height, lens.fx, lens.fy = WIDTH, HEIGHT, FOCAL, FOCAL
         lens.cx, lens.cy = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
         made.append(message.SerializeToString())
-    return made + made[-2:0:-1]
+    return made + made[-2:0:-1], jpeg_bytes / FRAMES
+
+
+def processor_s(process: int) -> float:
+    """User and system time of a process so far."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Run:
+    """What came of some seconds of robots."""
+
+    put: int
+    # Seconds until the reports that came.
+    took: list[float]
+    service_s: float
+    robots_s: float
+    wall_s: float
+
+    def describe(self) -> str:
+        frames = max(1, self.put)
+        machine_s = self.wall_s * (os.cpu_count() or 1)
+        return (
+            f"{describe(self.took)}; {self.put - len(self.took)} of {self.put} frames without a report; a frame costs"
+            f" {1e3 * self.service_s / frames:.1f} ms of processor in the service,"
+            f" {1e3 * self.robots_s / frames:.1f} ms in the robots, which take {self.robots_s / machine_s:.1%} of the"
+            f" machine, the service {self.service_s / machine_s:.0%}"
+        )
 
 
 class Robots:
@@ -91,10 +124,11 @@ class Robots:
         if left := self.left.get(key):
             self.took[key] = now - left
 
-    def run(self, seconds: float) -> tuple[int, list[float]]:
-        """Frames that were put after the warm-up, and the seconds until the report of those that had one."""
+    def run(self, seconds: float, service: int) -> Run:
+        """Counts after the warm-up only. `service` is its process."""
         start = time.perf_counter()
         counted = set()
+        begun = None
         turn = 0
         while (due := start + turn / (FPS * len(self.keys))) < start + WARM_UP_S + seconds:
             if (wait := due - time.perf_counter()) > 0:
@@ -108,12 +142,17 @@ class Robots:
             self.left[key] = time.perf_counter()
             self.publishers[robot].put(payload)
             if due >= start + WARM_UP_S:
+                begun = begun or (time.perf_counter(), processor_s(service), time.process_time())
                 counted.add(key)
             turn += 1
         end = time.perf_counter() + PATIENCE_S
         while time.perf_counter() < end and not counted <= self.took.keys():
             time.sleep(0.05)
-        return len(counted), [self.took[key] for key in counted if key in self.took]
+        assert begun, "the robots ran for longer than the warm-up"
+        now = (time.perf_counter(), processor_s(service), time.process_time())
+        wall_s, service_s, robots_s = (after - before for before, after in zip(begun, now, strict=True))
+        took = [self.took[key] for key in counted if key in self.took]
+        return Run(len(counted), took, service_s, robots_s, wall_s)
 
 
 def echo(endpoint: str) -> None:
@@ -159,11 +198,12 @@ def describe(seconds: list[float]) -> str:
     return f"median {median:.1f} ms, 99th percentile {late:.1f} ms"
 
 
-def serve(preset: str, robots: int, bodies: list[bytes], seconds: float) -> tuple[int, list[float]]:
+def serve(preset: str, robots: int, bodies: list[bytes], seconds: float) -> Run:
     daemon = Daemon("--preset", preset, "--engine", "cpu")
     try:
         with open_session(daemon.endpoint) as session:
-            return Robots(session, robots, min(robots, os.cpu_count() or 1), bodies).run(seconds)
+            places = min(robots, os.cpu_count() or 1)
+            return Robots(session, robots, places, bodies).run(seconds, daemon.process.pid)
     finally:
         daemon.end()
 
@@ -174,22 +214,23 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--first", type=int, default=10)
     parser.add_argument("--step", type=int, default=10)
+    parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--echo", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.echo:
         echo(options.echo)
         return
-    bodies = frames()
+    bodies, jpeg_bytes = frames(options.noise)
     size = np.mean([len(body) for body in bodies]) / 1024
-    print(f"frames of {size:.0f} KiB, {options.preset}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    sizes = f"frames of {size:.0f} KiB, {jpeg_bytes / 1024:.0f} of them JPEG"
+    print(f"{sizes}, {options.preset}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     print(f"echo: {describe(echo_times(bodies, options.seconds))}", flush=True)
-    put, took = serve(options.preset, 1, bodies, options.seconds)
-    print(f"1 robot: {describe(took)}; {put - len(took)} of {put} frames without a report", flush=True)
+    print(f"1 robot: {serve(options.preset, 1, bodies, options.seconds).describe()}", flush=True)
     sustained, robots = 0, options.first
     while True:
-        put, took = serve(options.preset, robots, bodies, options.seconds)
-        print(f"{robots} robots: {describe(took)}; {put - len(took)} of {put} frames without a report", flush=True)
-        if len(took) < put:
+        run = serve(options.preset, robots, bodies, options.seconds)
+        print(f"{robots} robots: {run.describe()}", flush=True)
+        if len(run.took) < run.put:
             break
         sustained, robots = robots, robots + options.step
     print(f"sustained: {sustained} robots at {FPS:.0f} frames a second")

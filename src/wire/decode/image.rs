@@ -72,7 +72,7 @@ pub fn grey(image: &Image, limits: Limits) -> Result<GreyImage, Refusal> {
 /// As [`colour`].
 pub fn depth_m(image: &Image, limits: Limits) -> Result<(usize, usize, Vec<f32>), Refusal> {
     let from_mm = |mm: u16| f32::from(mm) * METRES_PER_MILLIMETRE;
-    let (width, height, mut depth_m) = match image.encoding.as_str() {
+    Ok(match image.encoding.as_str() {
         "16UC1" => raw(image, limits, 2, 1, |row, data| {
             data.extend(
                 row.chunks_exact(2)
@@ -82,7 +82,8 @@ pub fn depth_m(image: &Image, limits: Limits) -> Result<(usize, usize, Vec<f32>)
         "32FC1" => raw(image, limits, 4, 1, |row, data| {
             data.extend(
                 row.chunks_exact(4)
-                    .map(|z| f32::from_le_bytes([z[0], z[1], z[2], z[3]])),
+                    .map(|z| f32::from_le_bytes([z[0], z[1], z[2], z[3]]))
+                    .map(|z| if z.is_finite() && z > 0.0 { z } else { 0.0 }),
             );
         })?,
         "png" => {
@@ -106,13 +107,7 @@ pub fn depth_m(image: &Image, limits: Limits) -> Result<(usize, usize, Vec<f32>)
                 ),
             ));
         }
-    };
-    for z in &mut depth_m {
-        if !(z.is_finite() && *z > 0.0) {
-            *z = 0.0;
-        }
-    }
-    Ok((width, height, depth_m))
+    })
 }
 
 /// Rows of a raw picture, appended one by one.
