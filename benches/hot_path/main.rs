@@ -2,21 +2,22 @@
 //!
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
 //! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a Xeon
-//! with AVX-512 (2.6 GHz), two cores and nothing else at work, least of 16 repetitions, milliseconds:
+//! with AVX-512 (2.6 GHz) and two cores, with real-time priority (`chrt -f 10`), because other work would take the second
+//! core, least of 10 repetitions, milliseconds:
 //!
 //! ```text
 //!                        320x240   noisy  3 views  15 views  2 threads | 640x480   noisy  3 views  15 views  2 threads
-//! paper, 7 views             7.2     8.4      4.0      13.4       4.5  |    26.0    33.4     15.2      54.1      15.5
-//! robust, one view more     10.9    12.3      7.3      18.9       8.4  |    40.2    49.5     27.9      76.8      29.5
-//! reference (of paper)       137     133        -         -         -  |     553     553        -         -         -
-//! reading (of paper)         2.2     2.2      0.9       4.3         -  |     5.8     5.3      2.2      12.5         -
+//! paper, 7 views             6.6     8.1      3.8      13.2       3.9  |    24.4    33.2     13.2      52.7      13.9
+//! robust, one view more      9.2    10.7      6.1      16.8       5.8  |    35.1    45.3     22.9      69.8      19.6
+//! reference (of paper)       163     161        -         -         -  |     643     646        -         -         -
+//! reading (of paper)         2.2     2.1      0.9       4.2         -  |     8.3     8.2      3.2      15.7         -
 //! ```
 //!
-//! Of the 7.2: recall 5.2, score 0.8, prepare 0.2, observe 0.1; of the 10.9: refine 1.7, recall 6.6, score 2.0, prepare
-//! 0.4. Drawing the meshes and gathering the records are 2 ms of recall each, merging 1; it takes 0.77, 0.75 and 0.69 ms a
-//! view with 3, 7 and 15 views. Of two threads that is the best; by the median they gain little here, because the second
-//! core is seldom free for a whole frame: 7.6 of 7.6 and 11.9 of 11.6 at 320x240, 21.5 of 28.2 and 35.6 of 43.5 at
-//! 640x480. `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
+//! Of the 6.6: recall 4.8, score 0.8, prepare 0.1, observe 0.1; of the 9.2: refine 1.1, recall 6.1, score 1.7, prepare
+//! 0.3. Two threads are 1.70 and 1.58 times as fast as one at 320x240, 1.76 and 1.79 at 640x480 (by the median 1.69, 1.61,
+//! 1.72, 1.73); two processes with one thread each do 1.9 times the work of one, which is the most that can be had here.
+//! Without priority, beside other work, nothing is gained by the median. A pool's thread that sleeps takes 0.04 to 0.08 ms
+//! to take over and hand back. Earlier, with nothing else at work: `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
 //! interleaved 4.9, MOG2 2.6, KNN 4.6, NumPy + SciPy 11.4; at 640x480 26.0, 41.3, 47.8, 16.4, 9.1, 18.9, 55.3. Seven of
 //! 1,000,000 viewpoints are selected in 0.006 ms.
 //!

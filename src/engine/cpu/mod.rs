@@ -311,13 +311,11 @@ impl CpuEngine {
             seen
         };
         let (surprise, posterior) = (&mut score.surprise, &mut score.posterior);
-        // From the end: what was recalled last is nearest at hand.
         if self.is_alone() {
             surprise
                 .chunks_mut(strip_pixels)
                 .zip(posterior.chunks_mut(strip_pixels))
                 .enumerate()
-                .rev()
                 .map(update)
                 .sum()
         } else {
@@ -326,7 +324,6 @@ impl CpuEngine {
                     .par_chunks_mut(strip_pixels)
                     .zip(posterior.par_chunks_mut(strip_pixels))
                     .enumerate()
-                    .rev()
                     .with_max_len(1)
                     .map(update)
                     .sum()
