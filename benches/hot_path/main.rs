@@ -17,7 +17,9 @@
 //! 0.3. Two threads are 1.70 and 1.58 times as fast as one at 320x240, 1.76 and 1.79 at 640x480 (by the median 1.69, 1.61,
 //! 1.72, 1.73); two processes with one thread each do 1.9 times the work of one, which is the most that can be had here.
 //! Without priority, beside other work, nothing is gained by the median. A pool's thread that sleeps takes 0.04 to 0.08 ms
-//! to take over and hand back. Earlier, with nothing else at work: `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
+//! to take over and hand back.
+//!
+//! Earlier, `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
 //! interleaved 4.9, MOG2 2.6, KNN 4.6, NumPy + SciPy 11.4; at 640x480 26.0, 41.3, 47.8, 16.4, 9.1, 18.9, 55.3. Seven of
 //! 1,000,000 viewpoints are selected in 0.006 ms.
 //!
