@@ -265,15 +265,17 @@ impl Step {
     fn see(&mut self, index: usize, weight: f32, inverse_depth: &Lanes) {
         for lane in 0..LANES {
             let inverse = inverse_depth[lane];
-            let seen = inverse > 0.0;
+            // By bits, because choices between sums become stores of some lanes, which the next view must wait for.
+            let seen = (inverse.to_bits().wrapping_neg() as i32 >> 31) as u32;
+            let if_seen = |value: f32| f32::from_bits(value.to_bits() & seen);
             // Of any positive number where unseen, so that nothing is infinite.
-            let positive = if seen { inverse } else { 1.0 };
+            let positive = f32::from_bits(inverse.to_bits() | (1.0f32.to_bits() & !seen));
             let near = reciprocal(positive);
             let depth_m = near * (2.0 - positive * near);
-            self.seen[lane] |= u32::from(seen) << index;
-            self.coverage[lane] += if seen { 1.0 } else { 0.0 };
-            self.weight[lane] += if seen { weight } else { 0.0 };
-            self.weighted_depth_m[lane] += if seen { weight * depth_m } else { 0.0 };
+            self.seen[lane] |= seen & (1 << index);
+            self.coverage[lane] += if_seen(1.0);
+            self.weight[lane] += if_seen(weight);
+            self.weighted_depth_m[lane] += if_seen(weight * depth_m);
         }
     }
 
@@ -356,10 +358,11 @@ impl Merged {
     #[inline(always)]
     fn write(&mut self, row: &mut [f32], width: usize, start: usize, count: usize) {
         self.0[prior::P2] = [0.0; LANES];
-        for (index, lanes) in self.0.iter().enumerate() {
+        for index in 0..prior::PLANES {
             // The next row of the same planes.
             prefetch(row, width * (prior::PLANES + index) + start);
-            let plane = &mut row[width * index..][..width];
+        }
+        for (plane, lanes) in row.chunks_exact_mut(width).zip(&self.0) {
             match plane[start..].first_chunk_mut() {
                 Some(slot) => *slot = *lanes,
                 None => plane[start..].copy_from_slice(&lanes[..count]),

@@ -601,9 +601,8 @@ impl QuadRow<'_> {
             while hits != 0 {
                 let hit = hits.trailing_zeros() as usize;
                 hits &= hits - 1;
-                let sample = (u64::from(batch.high[hit]) << 32) | u64::from(batch.low[hit]);
                 let slot = &mut target.map[batch.pixel[hit] as usize];
-                *slot = (*slot).max(sample);
+                *slot = (*slot).max(batch.sample[hit]);
             }
         }
     }
@@ -695,16 +694,14 @@ struct Block {
 /// What up to four candidates of sixteen quads show.
 #[repr(align(64))]
 struct Batch {
-    high: [u32; BATCH * LANES],
-    low: [u32; BATCH * LANES],
+    sample: [Sample; BATCH * LANES],
     /// Of the strip's map.
     pixel: [u32; BATCH * LANES],
 }
 
 impl Batch {
     const NONE: Self = Self {
-        high: [0; BATCH * LANES],
-        low: [0; BATCH * LANES],
+        sample: [0; BATCH * LANES],
         pixel: [0; BATCH * LANES],
     };
 }
@@ -835,9 +832,9 @@ impl Block {
         slot: usize,
     ) -> u16 {
         let lanes = slot * LANES..(slot + 1) * LANES;
-        let highs = &mut batch.high[lanes.clone()];
-        let lows = &mut batch.low[lanes.clone()];
+        let samples = &mut batch.sample[lanes.clone()];
         let pixels = &mut batch.pixel[lanes];
+        let (mut highs, mut lows) = ([0; LANES], [0; LANES]);
         let (width, start) = (target.width as i32, target.strip.start as i32);
         let rows = target.strip.len() as u32;
         let mut hits = [0u16; LANES];
@@ -883,6 +880,9 @@ impl Block {
             lows[lane] = (v << POSITION_BITS) | u;
             pixels[lane] = (y * width + x) as u32;
             hits[lane] = u16::from(hit) << lane;
+        }
+        for lane in 0..LANES {
+            samples[lane] = (u64::from(highs[lane]) << 32) | u64::from(lows[lane]);
         }
         hits.iter().fold(0, |mask, hit| mask | hit)
     }
