@@ -7,22 +7,22 @@ Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second e
 with noise, a pose. `--noise` is of the pictures, grey levels: with 10 of them a JPEG of quality 90 is as large as a
 camera's. `--stored`: what is learnt is stored in a folder, else it ends with the service. The messages are made before;
 while it runs a robot puts a stamp before one and sends it. First one robot: time from putting a frame to its report,
-beside the same bytes sent there and back by a process that does nothing else. Then more and more robots, in as many places as there are cores, each time on a
-fresh service, until a frame has no report. Robots and service share the machine; processor time is that of all threads,
-of the service and of the robots, after the warm-up.
+beside the same bytes sent there and back by a process that does nothing else. Then more and more robots, in as many
+places as there are cores, each time on a fresh service, until a frame has no report. Robots and service share the
+machine; processor time is that of all threads, of the service and of the robots, after the warm-up.
 
-A Xeon of 2.6 GHz, two cores, no builds beside it, frames of 171 KiB of which the JPEG is 21 (one run of 6 s each): the echo
-takes 0.9 ms (99th percentile 10 ms).
+A Xeon of 2.6 GHz, two cores, no builds beside it, frames of 171 KiB of which the JPEG is 21 (one run of 6 s each): the
+echo takes 0.9 ms (99th percentile 10 ms).
 
-`robust`: one robot's report comes after 13.3 ms (26), of which comparing takes 8.0, refining the pose 2.7, remembering 0.7,
-decoding 0.5 and everything else in the service 0.3. Of sixteen robots after 10.6 ms (47): a frame costs 14.3 ms of processor
-in the service and 0.5 in the robots, which take 3 % of the machine. Eighteen are at the edge: in three
-of four runs 18 to 36 of 756 frames had no report, in one all had (29 ms, 97). With `--set threads=1` on the service, where
-each place's thread works alone, all had in both of two runs between those (17 ms, 34 to 86). `paper`: 13.0 ms (15), of twenty-two robots 122 ms (225)
-at 11.1 ms of processor a frame, twenty-four are too many.
+`robust`: one robot's report comes after 13.3 ms (26), of which comparing takes 8.0, refining the pose 2.7, remembering
+0.7, decoding 0.5 and everything else in the service 0.3. Of sixteen robots after 10.6 ms (47): a frame costs 14.3 ms of
+processor in the service and 0.5 in the robots, which take 3 % of the machine. Eighteen are at the edge: in three of
+four runs 18 to 36 of 756 frames had no report, in one all had (29 ms, 97). With `--set threads=1` on the service, where
+each place's thread works alone, all had in both of two runs between those (17 ms, 34 to 86). `paper`: 13.0 ms (15), of
+twenty-two robots 122 ms (225) at 11.1 ms of processor a frame, twenty-four are too many.
 
-With `--noise 10` the JPEG has 34 KiB: decoding takes 0.6 ms, a frame costs 14.0 ms, sixteen robots are sustained too. With
-`--stored` a frame costs 16.9 ms: fourteen robots are sustained (52 ms, 151), sixteen are not.
+With `--noise 10` the JPEG has 34 KiB: decoding takes 0.6 ms, a frame costs 14.0 ms, sixteen robots are sustained too.
+With `--stored` a frame costs 16.9 ms: fourteen robots are sustained (52 ms, 151), sixteen are not.
 """
 
 import argparse
