@@ -1,26 +1,38 @@
 """From published frame to received report, and how many robots a machine sustains.
 
 Needs: pip install -r tests/python/requirements.txt; and `cargo build --release`.
-Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10] [--noise 8]`.
+Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10] [--noise 10] [--stored]`.
 
 Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second each: a JPEG, depth as 16-bit millimetres
-with noise, a pose. `--noise` is of the pictures, grey levels: with 8 of them a JPEG of quality 90 is as large as a
-camera's. The messages are made before; while it runs a robot puts a stamp before one and sends it. First one robot: time from putting a frame to its report, beside the same bytes sent there and back
-by a process that does nothing else. Then more and more robots, in as many places as there are cores, each time on a
-fresh service, until a frame has no report. Robots and service share the machine; processor time is that of all threads,
-of the service and of the robots, after the warm-up.
+with noise, a pose. `--noise` is of the pictures, grey levels: with 10 of them a JPEG of quality 90 is as large as a
+camera's. `--stored`: what is learnt is stored in a folder, else it ends with the service. The messages are made before;
+while it runs a robot puts a stamp before one and sends it. First one robot: time from putting a frame to its report,
+beside the same bytes sent there and back by a process that does nothing else. Then more and more robots, in as many
+places as there are cores, each time on a fresh service, until a frame has no report. Robots and service share the
+machine; processor time is that of all threads, of the service and of the robots, after the warm-up.
 
-A Xeon of 2.6 GHz, two cores, nothing else at work, frames of 171 KiB: the echo takes 0.9 ms (99th percentile 8 ms). `robust`: one
-robot's report comes after 14.3 ms (19.4), of sixteen robots after 9.5 ms (41), twenty are too many. `paper`: 13.1 ms (16.3), of
-twenty robots 6.9 ms (51), twenty-four are too many.
+A Xeon of 2.6 GHz, two cores, no builds beside it, frames of 171 KiB of which the JPEG is 21 (one run of 6 s each): the
+echo takes 0.9 ms (99th percentile 10 ms).
+
+`robust`: one robot's report comes after 13.3 ms (26), of which comparing takes 8.0, refining the pose 2.7, remembering
+0.7, decoding 0.5 and everything else in the service 0.3. Of sixteen robots after 10.6 ms (47): a frame costs 14.3 ms of
+processor in the service and 0.5 in the robots, which take 3 % of the machine. Eighteen are at the edge: in three of
+four runs 18 to 36 of 756 frames had no report, in one all had (29 ms, 97). With `--set threads=1` on the service, where
+each place's thread works alone, all had in both of two runs between those (17 ms, 34 to 86). `paper`: 13.0 ms (15), of
+twenty-two robots 122 ms (225) at 11.1 ms of processor a frame, twenty-four are too many.
+
+With `--noise 10` the JPEG has 34 KiB: decoding takes 0.6 ms, a frame costs 14.0 ms, sixteen robots are sustained too.
+With `--stored` a frame costs 16.9 ms: fourteen robots are sustained (52 ms, 151), sixteen are not.
 """
 
 import argparse
 import io
 import json
 import os
+import re
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from dataclasses import dataclass
@@ -88,9 +100,11 @@ class Run:
     service_s: float
     robots_s: float
     wall_s: float
+    # Of a frame's way in the service, milliseconds a frame, by part.
+    stages_ms: dict[str, float]
 
     def describe(self) -> str:
-        frames = max(1, self.put)
+        frames = max(1, len(self.took))
         machine_s = self.wall_s * (os.cpu_count() or 1)
         return (
             f"{describe(self.took)}; {self.put - len(self.took)} of {self.put} frames without a report; a frame costs"
@@ -124,8 +138,9 @@ class Robots:
         if left := self.left.get(key):
             self.took[key] = now - left
 
-    def run(self, seconds: float, service: int) -> Run:
-        """Counts after the warm-up only. `service` is its process."""
+    def run(self, seconds: float, daemon: Daemon) -> Run:
+        """Counts after the warm-up only."""
+        service = daemon.process.pid
         start = time.perf_counter()
         counted = set()
         begun = None
@@ -152,7 +167,8 @@ class Robots:
         now = (time.perf_counter(), processor_s(service), time.process_time())
         wall_s, service_s, robots_s = (after - before for before, after in zip(begun, now, strict=True))
         took = [self.took[key] for key in counted if key in self.took]
-        return Run(len(counted), took, service_s, robots_s, wall_s)
+        stages = stages_ms(daemon.fetch("/metrics")[2].decode())
+        return Run(len(counted), took, service_s, robots_s, wall_s, stages)
 
 
 def echo(endpoint: str) -> None:
@@ -191,6 +207,14 @@ def echo_times(bodies: list[bytes], seconds: float) -> list[float]:
     return times
 
 
+def stages_ms(metrics: str) -> dict[str, float]:
+    """Means over all places and frames so far."""
+    sums: dict[tuple[str, str], float] = {}
+    for of, stage, value in re.findall(r'^surprised_stage_seconds_(sum|count)\{.*stage="(\w+)".*\} (\S+)', metrics, re.M):
+        sums[of, stage] = sums.get((of, stage), 0.0) + float(value)
+    return {stage: 1e3 * total / sums["count", stage] for (of, stage), total in sums.items() if of == "sum"}
+
+
 def describe(seconds: list[float]) -> str:
     if not seconds:
         return "none came"
@@ -198,14 +222,17 @@ def describe(seconds: list[float]) -> str:
     return f"median {median:.1f} ms, 99th percentile {late:.1f} ms"
 
 
-def serve(preset: str, robots: int, bodies: list[bytes], seconds: float) -> Run:
-    daemon = Daemon("--preset", preset, "--engine", "cpu")
+def serve(options, robots: int, bodies: list[bytes]) -> Run:
+    folder = tempfile.TemporaryDirectory()
+    memory = Path(folder.name).as_uri() if options.stored else "memory://"
+    daemon = Daemon("--preset", options.preset, "--engine", "cpu", "--memory", memory)
     try:
         with open_session(daemon.endpoint) as session:
             places = min(robots, os.cpu_count() or 1)
-            return Robots(session, robots, places, bodies).run(seconds, daemon.process.pid)
+            return Robots(session, robots, places, bodies).run(options.seconds, daemon)
     finally:
         daemon.end()
+        folder.cleanup()
 
 
 def main() -> None:
@@ -215,6 +242,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=10)
     parser.add_argument("--step", type=int, default=10)
     parser.add_argument("--noise", type=float, default=0.0)
+    parser.add_argument("--stored", action="store_true")
     parser.add_argument("--echo", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.echo:
@@ -225,10 +253,12 @@ def main() -> None:
     sizes = f"frames of {size:.0f} KiB, {jpeg_bytes / 1024:.0f} of them JPEG"
     print(f"{sizes}, {options.preset}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
     print(f"echo: {describe(echo_times(bodies, options.seconds))}", flush=True)
-    print(f"1 robot: {serve(options.preset, 1, bodies, options.seconds).describe()}", flush=True)
+    run = serve(options, 1, bodies)
+    print(f"1 robot: {run.describe()}", flush=True)
+    print(f"of it: {', '.join(f'{stage} {ms:.2f} ms' for stage, ms in run.stages_ms.items())}", flush=True)
     sustained, robots = 0, options.first
     while True:
-        run = serve(options.preset, robots, bodies, options.seconds)
+        run = serve(options, robots, bodies)
         print(f"{robots} robots: {run.describe()}", flush=True)
         if len(run.took) < run.put:
             break
