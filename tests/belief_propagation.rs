@@ -156,7 +156,7 @@ fn reference(settings: &PropagationSettings, finest: Grid, contrasts: &[Contrast
                 settings.smooth
             }
         };
-        for iteration in 0..settings.iterations {
+        for iteration in 0..settings.iterations_at(at) {
             level.iterate(iteration, &smoothness);
         }
     }
@@ -193,14 +193,24 @@ fn case(
     width: impl Strategy<Value = usize>,
     height: impl Strategy<Value = usize>,
 ) -> impl Strategy<Value = Case> {
-    let settings = (smoothness(), smoothness(), 1..=5_usize, 2..=6_usize).prop_map(
-        |(smooth, across_contrast, levels, iterations)| PropagationSettings {
-            smooth,
-            across_contrast,
-            levels,
-            iterations,
-        },
-    );
+    let settings = (
+        smoothness(),
+        smoothness(),
+        1..=5_usize,
+        2..=6_usize,
+        2..=7_usize,
+    )
+        .prop_map(
+            |(smooth, across_contrast, levels, iterations, coarse_iterations)| {
+                PropagationSettings {
+                    smooth,
+                    across_contrast,
+                    levels,
+                    iterations,
+                    coarse_iterations,
+                }
+            },
+        );
     let highest_cost = prop_oneof![1_u8..40, Just(255)];
     (
         width,

@@ -1,7 +1,8 @@
 //! `evaluate --depth`: how good the depth from three cameras is, on a stereo folder or on simulated frames.
 
-use std::path::Path;
+use std::{path::Path, sync::Arc};
 
+use rayon::ThreadPool;
 use serde_json::json;
 
 use crate::{
@@ -21,6 +22,8 @@ pub const SIMULATED: &str = "simulated";
 /// Of the tabletop script: one in so many, from this one on. Some of them show the glass, some the cup.
 const SIMULATED_FIRST: u64 = 40;
 const SIMULATED_EVERY: u64 = 160;
+/// The memory that the service would have then sees one in so many.
+const REMEMBERED_EVERY: u64 = 10;
 
 /// # Errors
 /// A folder that cannot be read.
@@ -29,7 +32,8 @@ pub fn run(what: &str, settings: &Settings, seed: u64, as_json: bool) -> anyhow:
         .num_threads(settings.threads)
         .build()?;
     if what == SIMULATED {
-        pool.install(|| simulated(settings, seed, as_json));
+        let pool = Arc::new(pool);
+        pool.install(|| simulated(settings, seed, as_json, &pool));
         Ok(())
     } else {
         pool.install(|| stereo_folder(Path::new(what), settings.depth_labels, as_json))
@@ -76,21 +80,26 @@ fn stereo_folder(folder: &Path, labels: usize, as_json: bool) -> anyhow::Result<
     Ok(())
 }
 
-fn simulated(settings: &Settings, seed: u64, as_json: bool) {
+fn simulated(settings: &Settings, seed: u64, as_json: bool, pool: &Arc<ThreadPool>) {
     let script = Script::tabletop(seed);
     let end = script.frames.unwrap_or(0);
     let frames: Vec<u64> = (SIMULATED_FIRST..end)
         .step_by(SIMULATED_EVERY as usize)
         .collect();
     let within = simulated_depth::evaluate(&script, &frames, depth_range(settings));
+    let along_the_way =
+        simulated_depth::along_the_way(&script, &frames, REMEMBERED_EVERY, settings, pool.clone());
     if as_json {
-        println!("{}", json!(within));
+        let mut report = json!(within);
+        report["along_the_way"] = json!(along_the_way);
+        println!("{report}");
         return;
     }
     let mut table = Table::new(&[
         "frames",
         "labels",
         "within one %",
+        "along the way %",
         "of valid %",
         "at centres %",
         "mixed %",
@@ -105,6 +114,7 @@ fn simulated(settings: &Settings, seed: u64, as_json: bool) {
         within.frames.to_string(),
         within.labels.to_string(),
         number(within.within_one_label, 2),
+        number(along_the_way, 2),
         number(within.within_one_label_of_valid, 2),
         number(within.within_one_label_at_centre, 2),
         number(within.mixed, 2),

@@ -43,13 +43,24 @@ pub struct PropagationSettings {
     pub across_contrast: Smoothness,
     /// Resolutions, each half the one before; 1 to [`MOST_LEVELS`](Self::MOST_LEVELS).
     pub levels: usize,
-    /// At each level; at least 2, as each updates one colour of the checkerboard.
+    /// At the finest level and the one above; at least 2, as each updates one colour of the checkerboard.
     pub iterations: usize,
+    /// At each level above these two, where an iteration takes little time; at least 2 likewise.
+    pub coarse_iterations: usize,
 }
 
 impl PropagationSettings {
     /// Costs of 4^4 pixels, the coarsest, still sum up in 16 bits.
     pub const MOST_LEVELS: usize = 5;
+
+    /// Of a level; 0 is the finest.
+    pub fn iterations_at(&self, level: usize) -> usize {
+        if level < 2 {
+            self.iterations
+        } else {
+            self.coarse_iterations
+        }
+    }
 
     /// A cost this far above its pixel's least is as good as infinite.
     fn saturation(&self) -> u8 {
@@ -104,7 +115,10 @@ impl BeliefPropagation {
             );
         }
         assert!((1..=PropagationSettings::MOST_LEVELS).contains(&settings.levels));
-        assert!(settings.iterations >= 2, "both colours have their turn");
+        assert!(
+            settings.iterations.min(settings.coarse_iterations) >= 2,
+            "both colours have their turn"
+        );
         let mut board = Checkerboard::new(width, height);
         let mut levels = Vec::new();
         loop {
@@ -304,14 +318,15 @@ impl BeliefPropagation {
             stride,
             ..
         } = costs.board;
+        let iterations = settings.iterations_at(at);
         // A narrow band would do more rows of its neighbours than of its own.
         let bands = rayon::current_num_threads()
-            .min(height / (4 * (settings.iterations + 1)))
+            .min(height / (4 * (iterations + 1)))
             .max(1);
         let rows = height.div_ceil(bands);
         let bands = height.div_ceil(rows);
         // Even, so that each slot keeps its parity, and what nobody sends at the left and right border stays 0.
-        let slots = (settings.iterations + 3).next_multiple_of(2);
+        let slots = (iterations + 3).next_multiple_of(2);
         rings.resize_with(bands, || {
             (0..slots)
                 .map(|_| AlignedBytes::zeroed(8 * costs.labels * stride))
@@ -321,7 +336,7 @@ impl BeliefPropagation {
             costs,
             weights,
             first,
-            iterations: settings.iterations,
+            iterations,
             isa: *isa,
         };
         let outputs: Vec<Output<'_>> = if hand_down {

@@ -2,10 +2,10 @@
 //! middle image lies at each hypothesis, by its luminance in the left and in the right image.
 //! In: luminance of two or three cameras, the rig, the range of inverse depth (1/m). Out: a cost volume, grey levels.
 //! Open in the paper: the cost. Chosen: per side the difference to the interval of luminance that the hypothesis and
-//! its halves towards the next ones span (Birchfield and Tomasi 1998), twice where there is little texture,
-//! cut at `most_difference`; of the two sides
-//! the mean, but where they disagree no more than the better one and `occlusion`, as the other camera may not see the
-//! point; a side that looks past its image has no vote. Exposure of the side images is matched to the middle's.
+//! its halves towards the next ones span (Birchfield and Tomasi 1998), three times where there is little texture, cut at
+//! `most_difference`; of the two sides the mean, but where they disagree no more than the better one and `occlusion`,
+//! as the other camera may not see the point; a side that looks past its image has no vote. Exposure of the side images
+//! is matched to the middle's.
 
 use super::{
     checkerboard::{Checkerboard, CostRow},
@@ -41,7 +41,7 @@ impl SweepSettings {
 pub(super) struct Middle<'a> {
     pub intrinsics: &'a Intrinsics,
     pub luminance: &'a [u8],
-    /// 255 where a difference counts twice, else 0.
+    /// 255 where a difference counts three times, else 0.
     pub weak: &'a [u8],
     /// Metres, 0 = none.
     pub expected_depth_m: Option<&'a [f32]>,
@@ -256,7 +256,11 @@ unsafe fn cost_kernel<V: Lanes>(
                             .max(low.sub_saturating(luminance));
                         difference = difference.add_saturating(rounded);
                     }
-                    differences[side] = difference.add_saturating(difference.min(weak)).min(most);
+                    let more = difference.min(weak);
+                    differences[side] = difference
+                        .add_saturating(more)
+                        .add_saturating(more)
+                        .min(most);
                     let blocker_at = strip.blocker_at.get_unchecked(label)[row.parity] + start;
                     blockers[side] = V::load(strip.blocker.as_ptr().add(blocker_at));
                 }

@@ -18,7 +18,7 @@ pub(super) struct Textures {
 }
 
 impl Textures {
-    /// 255 where neighbours differ by no more than `most` grey levels on average, else 0.
+    /// 255 where neighbours differ by no more than `most` half grey levels on average, else 0.
     pub fn find_weak(&mut self, luminance: &[u8], width: usize, most: u8) -> &[u8] {
         let height = luminance.len() / width;
         let Self {
@@ -61,7 +61,7 @@ impl Textures {
             }
             let rows = (y + REACH + 1).min(height) - y.saturating_sub(REACH);
             let is_weak = |sum: u16, pixels: usize| {
-                if usize::from(sum) <= usize::from(most) * pixels {
+                if 2 * usize::from(sum) <= usize::from(most) * pixels {
                     255
                 } else {
                     0
