@@ -215,10 +215,8 @@ fn log_predictive(belief: &Belief, observed: [f32; CHANNELS]) -> f32 {
 /// pixels that nobody saw or beyond the image do not count. The same for every channel.
 #[derive(Debug, Default)]
 pub struct EdgeWeights {
-    above: Vec<f32>,
-    left: Vec<f32>,
-    right: Vec<f32>,
-    below: Vec<f32>,
+    /// Above, left, right and below, a row each.
+    rows: Vec<f32>,
 }
 
 /// A plane's row between its neighbours; `None` = beyond the image.
@@ -229,17 +227,13 @@ impl EdgeWeights {
     #[inline(always)]
     pub fn find(&mut self, (above, here, below): RowAround) {
         let width = here.len();
-        for plane in [
-            &mut self.above,
-            &mut self.left,
-            &mut self.right,
-            &mut self.below,
-        ] {
-            plane.clear();
-            plane.resize(width, 0.0);
-        }
+        self.rows.clear();
+        self.rows.resize(4 * width, 0.0);
+        let (above_left, right_below) = self.rows.split_at_mut(2 * width);
+        let (above_weights, left_weights) = above_left.split_at_mut(width);
+        let (right_weights, below_weights) = right_below.split_at_mut(width);
         let [above, below] =
-            [(above, &mut self.above), (below, &mut self.below)].map(|(coverage, weights)| {
+            [(above, above_weights), (below, below_weights)].map(|(coverage, weights)| {
                 if let Some(coverage) = coverage {
                     for ((weight, &there), &here) in weights.iter_mut().zip(coverage).zip(here) {
                         *weight = both_seen(here, there);
@@ -252,12 +246,12 @@ impl EdgeWeights {
             return;
         }
         let pairs = here.iter().zip(&here[1..]);
-        let weights = self.right.iter_mut().zip(&mut self.left[1..]);
+        let weights = right_weights.iter_mut().zip(&mut left_weights[1..]);
         for ((right, left), (&a, &b)) in weights.zip(pairs) {
             *right = both_seen(a, b);
             *left = *right;
         }
-        average(&mut self.left, &mut self.right);
+        average(left_weights, right_weights);
     }
 
     /// Mean squared one-sided difference of one plane in x plus that in y: G of step 4, squared grey levels a pixel.
@@ -267,7 +261,8 @@ impl EdgeWeights {
         // Beyond the image any row does, as it has no weight.
         let (above, below) = (above.unwrap_or(here), below.unwrap_or(here));
         let (above, here, below) = (&above[..width], &here[..width], &below[..width]);
-        let (above_weight, below_weight) = (&self.above[..width], &self.below[..width]);
+        let [above_weight, left_weight, right_weight, below_weight] =
+            [0, 1, 2, 3].map(|side| &self.rows[side * width..][..width]);
         for x in 0..width {
             gradient[x] = squared(here[x], above[x]) * above_weight[x]
                 + squared(here[x], below[x]) * below_weight[x];
@@ -275,7 +270,6 @@ impl EdgeWeights {
         if width < 2 {
             return;
         }
-        let (left_weight, right_weight) = (&self.left[..width], &self.right[..width]);
         for x in 1..width - 1 {
             gradient[x] += squared(here[x], here[x - 1]) * left_weight[x]
                 + squared(here[x], here[x + 1]) * right_weight[x];
