@@ -10,7 +10,7 @@ use surprised::{
 fn twenty_four_of_twenty_five_pixels_of_the_simulated_room_are_within_one_label() {
     let frames: Vec<u64> = (40..1300).step_by(160).collect();
     let within = evaluate(
-        &Script::tabletop(4),
+        &Script::tabletop(5),
         &frames,
         depth_range(&Settings::robust()),
     );
