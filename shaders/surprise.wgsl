@@ -77,7 +77,7 @@ fn joint_surprise(prior: Belief, observed: vec3<f32>, surprise1: f32) -> vec2<f3
     let p2 = clamp(prior.p2, EARLIER_SHARE_LOW, EARLIER_SHARE_HIGH);
     let p1 = 1.0 - p2;
     let log_odds = log_predictive(earlier, observed) - log_predictive(prior, observed) + ln(p2 / p1);
-    let rho2 = 1.0 / (1.0 + exp_of(-log_odds));
+    let rho2 = 1.0 / (1.0 + exp2_of(clamp(-LOG2_E * log_odds, -126.0, 127.0)));
     let rho1 = 1.0 - rho2;
     let sum = share_term(rho1, p1, surprise1) + share_term(rho2, p2, surprise2);
     return vec2<f32>(max(sum, 0.0), rho2);

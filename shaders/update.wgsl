@@ -1,6 +1,6 @@
 // Twin of src/stages/update.rs: what an observation does to a belief, (10) and (12) to (15).
 
-const EXPONENT_MAX: f32 = 80.0;
+const EXPONENT_MAX: f32 = 115.0;
 const START_ALPHA: f32 = 1.3;
 const START_SIGMA: f32 = 0.8;
 
@@ -18,7 +18,7 @@ fn alpha_after(alpha0: f32) -> f32 {
 
 /// (10)
 fn sigma_p_of(sigma0: f32, uncertainty: f32) -> f32 {
-    let grown = sigma0 * exp_of(min(rules.xi * uncertainty, EXPONENT_MAX));
+    let grown = sigma0 * exp2_of(min(rules.xi * LOG2_E * uncertainty, EXPONENT_MAX));
     return min(max(grown, rules.sigma_min), rules.sigma_max);
 }
 

@@ -90,7 +90,6 @@ fn a_frame_that_overwrites_allocates_nothing() {
             surprise_threshold: 1e6,
             ..Settings::preset(preset)
         };
-        let pool = reference::pool(threads);
         let mut pipeline = Pipeline::new(settings, reference::pool(threads));
         let mut round = || {
             let before = ALLOCATIONS.load(Ordering::Relaxed);

@@ -299,6 +299,7 @@ fn all_rust_constants() -> BTreeMap<String, Vec<f64>> {
         &mut found,
     );
     // Not written as numbers there.
+    found.insert("LN_2".into(), vec![std::f64::consts::LN_2]);
     found.insert("LOG2_E".into(), vec![std::f64::consts::LOG2_E]);
     found.insert("BIAS_SCALE".into(), vec![2f64.powi(112)]);
     found.insert("BIAS_SCALE_INVERSE".into(), vec![2f64.powi(-112)]);
