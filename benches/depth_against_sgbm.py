@@ -4,16 +4,13 @@
     target/venv/bin/python benches/depth_against_sgbm.py ../shared/data/tsukuba
 
 Prints the time of the processor for one thread and of the clock for two, best and median of the repetitions in turns.
-A Xeon with AVX-512, two cores, nothing else at work; best of 40, milliseconds, and their share of SGBM's; 64 labels.
+A Xeon with AVX-512, two cores, with real-time priority (`chrt -f 10`); best of 40, milliseconds, and their share of SGBM's; 64 labels.
 
     size     threads  SGBM-HH, 2 cameras  ours, 3 cameras  ours, 2 cameras
-    320x240  1         13.7               14.2 (1.03)      13.3 (0.97)
-    320x240  2         13.6               10.0 (0.73)       8.9 (0.66)
-    640x480  1         77.5               50.8 (0.66)      45.2 (0.58)
-    640x480  2         76.6               33.5 (0.44)      28.3 (0.37)
-
-The table is from when the coarse levels had two iterations, as the fine ones. With six, one thread at 320x240 takes 1.14 and
-1.16 of SGBM's time (14.2 of 12.5 and 13.8 of 12.0 ms, best of 200 in turns, on a busy machine; 0.98 and 1.06 with two).
+    320x240  1         14.0               15.4 (1.10)      14.1 (1.01)
+    320x240  2         14.0               10.2 (0.73)       9.1 (0.65)
+    640x480  1         79.2               53.2 (0.67)      49.8 (0.63)
+    640x480  2         78.5               33.0 (0.42)      28.5 (0.36)
 """
 
 import pathlib
