@@ -108,7 +108,7 @@ def test_events_go_on_after_a_kill(services, url):
             robot.show(scene.BOX)
         (event,) = events(first)
         kept = Path(urllib.parse.urlparse(url).path) / "lab" / "events"
-        await_condition("it is stored", lambda: any(kept.glob(f"{int(event['id']):016x}-*[0-9a-f]")))
+        await_condition("it is stored", lambda: any(kept.glob(f"{int(event['id']):016x}-????????-????????????????")))
         path = f"/api/v1/places/lab/events/{event['id']}/seen.jpg"
         picture = first.fetch(path)[2]
     first.stop(signal.SIGKILL)
