@@ -19,8 +19,8 @@
 //! Without priority, beside other work, nothing is gained by the median. A pool's thread that sleeps takes 0.04 to 0.08 ms
 //! to take over and hand back.
 //!
-//! Earlier, `peers.py`, least of 60 (640x480: 30): at 320x240 `paper` 6.7, `robust` 11.2, remap of 70 planes 12.9,
-//! interleaved 4.9, MOG2 2.6, KNN 4.6, NumPy + SciPy 11.4; at 640x480 26.0, 41.3, 47.8, 16.4, 9.1, 18.9, 55.3. Seven of
+//! `peers.py`, likewise, least of 40 (640x480: 16): at 320x240 `paper` 6.7, `robust` 9.6, remap of 70 planes 13.1,
+//! interleaved 5.1, MOG2 2.5, KNN 5.1, NumPy + SciPy 11.5; at 640x480 25.0, 37.3, 50.9, 17.3, 9.5, 20.6, 59.5. Seven of
 //! 1,000,000 viewpoints are selected in 0.006 ms.
 //!
 //! How exact it is, as `tests/merge.rs`, `belief.rs` and `storage.rs` print it: from seven views of a smooth scene tau is
