@@ -1,4 +1,5 @@
-//! Values side by side, and `ln` and `exp2` without branches or calls, so that a loop over pixels becomes vector code on any processor.
+//! Values side by side, and `ln` and `exp2` without branches or calls, so that a loop over pixels becomes vector code on
+//! any processor.
 //! Single precision: relative error below 2e-7 over the ranges that beliefs take (tested against `f64`).
 
 use std::f32::consts::LN_2;

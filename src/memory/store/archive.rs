@@ -15,8 +15,9 @@
 //!     8  checksum of everything before, as of an object
 //! ```
 //!
-//! Version 1, which is still read, has viewpoints alone, and neither their kind nor their id beside them. Numbers are little-endian. A file is written aside and renamed when it is whole; one that is read is checked from end
-//! to end before anything of it is stored. Neither holds more than a few viewpoints at a time.
+//! Version 1, which is still read, has viewpoints alone, and neither their kind nor their id beside them. Numbers are
+//! little-endian. A file is written aside and renamed when it is whole; one that is read is checked from end to end
+//! before anything of it is stored. Neither holds more than a few viewpoints at a time.
 
 use std::{
     fs::File,

@@ -175,6 +175,7 @@ impl Desk {
         }
         None
     }
+
     /// The poses to compare, and the camera they are imagined for.
     fn candidates(
         &self,
