@@ -28,14 +28,14 @@ fn label() -> Label {
     }
 }
 
-/// Records of any bits, depths of any positive value, some without.
+/// Records of any bits that are non-negative numbers, depths of any positive value, some without.
 fn any_viewpoint(width: usize, height: usize, seed: u64) -> Viewpoint {
     let mut random = Random(seed);
     let camera = scene::camera(width, height);
     let mut bits = || random.below(1 << 16) as u16;
     let records = (0..camera.pixels())
         .map(|_| Record {
-            spread: [0; 8].map(|_: u16| bits()),
+            spread: [0; 8].map(|_: u16| bits() % 0x7c00),
             level: [0; 8].map(|_: u16| bits() as i16),
         })
         .collect();
@@ -98,6 +98,17 @@ fn a_head_is_read_without_the_planes() {
     assert_eq!(read.head, viewpoint.head());
     assert_eq!(read.label, label());
     assert_eq!(read.object_bytes, object.len() as u64);
+}
+
+#[test]
+fn a_belief_that_is_no_number_is_refused() {
+    for (place, value) in [(0, 0x7c00), (3, 0x7e01), (7, 0x8001)] {
+        let mut viewpoint = any_viewpoint(9, 7, 6);
+        viewpoint.records[5].spread[place] = value;
+        let object = form::encode(&label(), &viewpoint);
+        let error = form::decode(&object, PIXELS_MAX).expect_err("it is refused");
+        assert!(error.to_string().contains("belief"), "{error}");
+    }
 }
 
 #[test]

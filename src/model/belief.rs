@@ -142,6 +142,12 @@ impl Record {
         T::rows(&words, bytemuck::cast_mut(records));
     }
 
+    /// Whether it is one that [`Self::pack`] may make: nothing of it is negative, infinite or no number.
+    pub fn is_sound(&self) -> bool {
+        const INFINITE: u16 = 0x7c00;
+        self.spread.iter().all(|&value| value < INFINITE)
+    }
+
     #[inline(always)]
     pub fn unpack(&self) -> Belief {
         let spread = self.spread.map(f32_from_f16);

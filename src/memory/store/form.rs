@@ -33,6 +33,7 @@ use super::planes;
 use crate::{
     memory::Version,
     model::{
+        belief::Record,
         camera::Intrinsics,
         frame::Source,
         pose::{Pose, pose_from_parts},
@@ -266,6 +267,10 @@ pub fn decode(bytes: &[u8], pixels_max: usize) -> Result<(Label, Viewpoint), For
         });
     }
     let (records, depth_m) = planes::unpack(packed, pixels as usize)?;
+    // One infinite belief would spoil pixels that do not see it: what weighs nothing is summed too.
+    if !records.iter().all(Record::is_sound) {
+        return Err(FormError::Value("belief"));
+    }
     let viewpoint = Viewpoint::from_stored(read.head, depth_m, read.joined, records);
     Ok((read.label, viewpoint))
 }
