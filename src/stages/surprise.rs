@@ -270,12 +270,19 @@ impl EdgeWeights {
         if width < 2 {
             return;
         }
-        for x in 1..width - 1 {
-            gradient[x] += squared(here[x], here[x - 1]) * left_weight[x]
-                + squared(here[x], here[x + 1]) * right_weight[x];
+        // Slices of one length, so that no step has to be checked.
+        let inner = width - 2;
+        let [left, right] = [0, 2].map(|first| &here[first..][..inner]);
+        let [left_weight, right_weight] =
+            [left_weight, right_weight].map(|weight| &weight[1..][..inner]);
+        let (middle, sums) = (&here[1..][..inner], &mut gradient[1..][..inner]);
+        for x in 0..inner {
+            sums[x] += squared(middle[x], left[x]) * left_weight[x]
+                + squared(middle[x], right[x]) * right_weight[x];
         }
-        gradient[0] += squared(here[0], here[1]) * right_weight[0];
-        gradient[width - 1] += squared(here[width - 1], here[width - 2]) * left_weight[width - 1];
+        let [first_weight, last_weight] = [self.rows[2 * width], self.rows[2 * width - 1]];
+        gradient[0] += squared(here[0], here[1]) * first_weight;
+        gradient[width - 1] += squared(here[width - 1], here[width - 2]) * last_weight;
     }
 }
 

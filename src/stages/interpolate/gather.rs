@@ -453,8 +453,11 @@ mod x86 {
     #[inline]
     #[target_feature(enable = "avx2")]
     fn each_four_times(words: &[u32; LANES], at: usize) -> __m256i {
-        let [first, second] = [words[at], words[at + 1]].map(|word| _mm256_set1_epi32(word as i32));
-        _mm256_blend_epi32::<0b1111_0000>(first, second)
+        // Two words into every half, then one of them over each: a broadcast apiece and a choice become four steps.
+        // SAFETY: `at` is even and below sixteen, so two words can be read there.
+        let two = unsafe { _mm_loadl_epi64(words.as_ptr().add(at).cast()) };
+        let order = _mm256_setr_epi32(0, 0, 0, 0, 1, 1, 1, 1);
+        _mm256_permutevar8x32_epi32(_mm256_castsi128_si256(two), order)
     }
 
     #[inline]

@@ -167,6 +167,9 @@ impl FlatPatch {
         let depth = [d.x, d.y, d.z];
         let starts = [start(column), start(row), start(divisor), start(depth)];
         let slopes = [column[0], row[0], divisor[0], depth[0]].map(|slope| slope as f32);
+        // Read here, because what is read under a condition on lanes becomes a gather.
+        let (columns, rows) = (self.columns, self.rows);
+        let (first_column, first_row) = (self.first_column, self.first_row);
         for at in (first..end).step_by(LANES) {
             let slots: &mut [Sample; LANES] = (&mut map[at..at + LANES])
                 .try_into()
@@ -183,10 +186,10 @@ impl FlatPatch {
                     let value = if value > 0.0 { value } else { 0.0 };
                     if value < most { value } else { most }
                 };
-                let column = within((slopes[0] * x + starts[0]) * r, self.columns);
-                let row = within((slopes[1] * x + starts[1]) * r, self.rows);
-                let u = (column * STEPS + self.first_column).to_bits() & INTEGER_MASK;
-                let v = (row * STEPS + self.first_row).to_bits() & INTEGER_MASK;
+                let column = within((slopes[0] * x + starts[0]) * r, columns);
+                let row = within((slopes[1] * x + starts[1]) * r, rows);
+                let u = (column * STEPS + first_column).to_bits() & INTEGER_MASK;
+                let v = (row * STEPS + first_row).to_bits() & INTEGER_MASK;
                 let depth = (slopes[3] * x + starts[3]).to_bits() >> INVERSE_DEPTH_SHIFT;
                 let high = (depth << (2 * POSITION_BITS - 32)) | (v >> (32 - POSITION_BITS));
                 // Beyond the span nothing is shown.
