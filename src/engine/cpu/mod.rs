@@ -34,9 +34,16 @@ use crate::{
 use score::{ScoreRules, ScoreScratch};
 use strips::StripScratch;
 
-/// Rows of a strip: its maps of seven views of 640 pixels stay within 450 KB, beside the records that they lead to, in a
-/// core's second-level cache.
-const STRIP_ROWS: usize = 12;
+/// Pixels of a strip, about: its maps of seven views stay within 450 KB, beside the records that they lead to, in a core's
+/// second-level cache. What lies across two strips is drawn for both, so that many short ones cost more.
+const STRIP_PIXELS: usize = 640 * 12;
+/// Bounds of its rows: few enough for even shares among some threads.
+const STRIP_ROWS: (usize, usize) = (8, 24);
+
+fn strip_rows(width: usize) -> usize {
+    let (least, most) = STRIP_ROWS;
+    (STRIP_PIXELS / width.max(1)).clamp(least, most)
+}
 
 /// A viewpoint to recall from.
 #[derive(Clone, Copy)]
@@ -248,11 +255,12 @@ impl CpuEngine {
         let mut reaches = self.reaches();
         let recall = Recall::new(self, views, intrinsics, world_from_camera, &mut reaches);
         prior.resize(intrinsics.width, intrinsics.height);
-        let strip_values = STRIP_ROWS * intrinsics.width * prior::PLANES;
+        let strip_rows = strip_rows(intrinsics.width);
+        let strip_values = strip_rows * intrinsics.width * prior::PLANES;
         let recall = |(strip, rows): (usize, &mut [f32])| {
             let scratch = &mut *self.thread_scratch();
             recall.strip(strip, rows, &mut scratch.strip);
-            then(strip * STRIP_ROWS, rows, scratch);
+            then(strip * strip_rows, rows, scratch);
         };
         let data = &mut prior.data;
         if self.is_alone() {
@@ -284,10 +292,11 @@ impl CpuEngine {
         score.resize(prior, observation);
         score.gain = gain;
         let (width, inverse_gain) = (prior.width, 1.0 / score.gain);
-        let strip_pixels = STRIP_ROWS * width;
+        let strip_rows = strip_rows(width);
+        let strip_pixels = strip_rows * width;
         let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
             let scratch = &mut self.thread_scratch().score;
-            let rows = strip * STRIP_ROWS..prior.height;
+            let rows = strip * strip_rows..prior.height;
             let mut seen = 0;
             for (y, (surprise, posterior)) in rows.zip(
                 surprise
@@ -392,6 +401,8 @@ impl CpuEngine {
         prior.resize(width, height);
         score.resize(prior, observation);
         score.gain = 1.0;
+        let strip_rows = strip_rows(width);
+        let strip_pixels = strip_rows * width;
         type Strip<'a> = ((&'a mut [f32], &'a mut [f32]), &'a mut [Record]);
         let both = |(strip, ((rows, surprise), posterior)): (usize, Strip)| {
             let Scratch {
@@ -411,7 +422,7 @@ impl CpuEngine {
                     None,
                     PriorRow::of(rows, row, width),
                     None,
-                    observation.row(strip * STRIP_ROWS + row),
+                    observation.row(strip * strip_rows + row),
                     1.0,
                     &self.score_rules,
                     scratch,
@@ -422,7 +433,6 @@ impl CpuEngine {
             }
             seen
         };
-        let strip_pixels = STRIP_ROWS * width;
         let (data, surprise) = (&mut prior.data, &mut score.surprise);
         let posterior = &mut score.posterior;
         if self.is_alone() {
@@ -577,7 +587,7 @@ impl<'a> Recall<'a> {
             &self.views,
             self.engine.merge_rules,
             self.width,
-            strip * STRIP_ROWS,
+            strip * strip_rows(self.width),
             rows,
         );
     }
