@@ -35,15 +35,11 @@ use score::{ScoreRules, ScoreScratch};
 use strips::StripScratch;
 
 /// Pixels of a strip, about: its maps of seven views stay within 450 KB, beside the records that they lead to, in a core's
-/// second-level cache. What lies across two strips is drawn for both, so that many short ones cost more.
+/// second-level cache.
 const STRIP_PIXELS: usize = 640 * 12;
-/// Bounds of its rows: few enough for even shares among some threads.
-const STRIP_ROWS: (usize, usize) = (8, 24);
-
-fn strip_rows(width: usize) -> usize {
-    let (least, most) = STRIP_ROWS;
-    (STRIP_PIXELS / width.max(1)).clamp(least, most)
-}
+/// Most rows of a strip, for one thread and for several: what lies across two strips is drawn for both, so that long ones
+/// cost less, but shares of few strips are not even.
+const STRIP_ROWS_MAX: [usize; 2] = [24, 12];
 
 /// A viewpoint to recall from.
 #[derive(Clone, Copy)]
@@ -255,7 +251,7 @@ impl CpuEngine {
         let mut reaches = self.reaches();
         let recall = Recall::new(self, views, intrinsics, world_from_camera, &mut reaches);
         prior.resize(intrinsics.width, intrinsics.height);
-        let strip_rows = strip_rows(intrinsics.width);
+        let strip_rows = recall.strip_rows;
         let strip_values = strip_rows * intrinsics.width * prior::PLANES;
         let recall = |(strip, rows): (usize, &mut [f32])| {
             let scratch = &mut *self.thread_scratch();
@@ -292,7 +288,7 @@ impl CpuEngine {
         score.resize(prior, observation);
         score.gain = gain;
         let (width, inverse_gain) = (prior.width, 1.0 / score.gain);
-        let strip_rows = strip_rows(width);
+        let strip_rows = self.strip_rows(width);
         let strip_pixels = strip_rows * width;
         let update = |(strip, (surprise, posterior)): (usize, (&mut [f32], &mut [Record]))| {
             let scratch = &mut self.thread_scratch().score;
@@ -401,7 +397,7 @@ impl CpuEngine {
         prior.resize(width, height);
         score.resize(prior, observation);
         score.gain = 1.0;
-        let strip_rows = strip_rows(width);
+        let strip_rows = recall.strip_rows;
         let strip_pixels = strip_rows * width;
         type Strip<'a> = ((&'a mut [f32], &'a mut [f32]), &'a mut [Record]);
         let both = |(strip, ((rows, surprise), posterior)): (usize, Strip)| {
@@ -502,6 +498,11 @@ impl CpuEngine {
         }
     }
 
+    fn strip_rows(&self, width: usize) -> usize {
+        let most = STRIP_ROWS_MAX[usize::from(!self.is_alone())];
+        (STRIP_PIXELS / width.max(1)).clamp(1, most)
+    }
+
     /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
     fn is_alone(&self) -> bool {
         self.pool.current_num_threads() == 1
@@ -526,6 +527,7 @@ struct Recall<'a> {
     projectors: ArrayVec<Projector<'a>, VIEWS_MAX>,
     views: ArrayVec<MergeView<'a>, VIEWS_MAX>,
     width: usize,
+    strip_rows: usize,
 }
 
 impl<'a> Recall<'a> {
@@ -576,6 +578,7 @@ impl<'a> Recall<'a> {
                 })
                 .collect(),
             width: intrinsics.width,
+            strip_rows: engine.strip_rows(intrinsics.width),
         }
     }
 
@@ -587,7 +590,7 @@ impl<'a> Recall<'a> {
             &self.views,
             self.engine.merge_rules,
             self.width,
-            strip * strip_rows(self.width),
+            strip * self.strip_rows,
             rows,
         );
     }
