@@ -24,7 +24,8 @@ use crate::{
         interpolate::{
             merge::{MergeRules, MergeView},
             prior::{self, Prior, PriorRow},
-            project::{Projector, Reach},
+            project::Projector,
+            reach::Reach,
         },
         surprise::GammaTerm,
         update::UpdateRules,

@@ -7,7 +7,8 @@ use crate::{
         gather::Portable,
         merge::{MergeRules, MergeScratch, MergeView, merge_row},
         prior::PLANES,
-        project::{ProjectScratch, Projector, Sample, draw, map_size},
+        project::{ProjectScratch, Projector, draw},
+        sample::{Sample, map_size},
     },
 };
 

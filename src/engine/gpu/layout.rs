@@ -11,7 +11,7 @@ use crate::{
     },
     stages::{
         attend::BLOCK,
-        interpolate::project::homography,
+        interpolate::reach::homography,
         refine::{LEVELS_MAX, discount, precision},
         surprise::GammaTerm,
         update::UpdateRules,

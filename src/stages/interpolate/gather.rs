@@ -9,11 +9,11 @@ use crate::{
     model::belief::{LEVEL_SCALE, Record, f32_from_f16},
 };
 
-use super::project::{STEPS, Sample, split};
+use super::sample::{STEPS, Sample, split};
 
 /// Steps of a source pixel, as integers.
 const WHOLE: u32 = STEPS as u32;
-/// So that a view of [`super::project::SIDE_MAX`] squared is addressed with 32 bits.
+/// So that a view of [`super::sample::SIDE_MAX`] squared is addressed with 32 bits.
 const RECORD_BYTES: u32 = size_of::<Record>() as u32;
 /// Units of [`Sums`]' levels per grey level: weights count [`STEPS`], so that the sum over a triangle is exact.
 pub const LEVEL_UNITS: f32 = LEVEL_SCALE * STEPS;

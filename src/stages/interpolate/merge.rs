@@ -16,7 +16,7 @@ use crate::{
 use super::{
     gather::{Gather, GatherView, LEVEL_UNITS, Source, Sums},
     prior,
-    project::Sample,
+    sample::Sample,
 };
 
 /// Channels together must differ by more than this, grey levels, before views vote on colour: below it the mean is as

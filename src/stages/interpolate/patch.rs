@@ -11,8 +11,10 @@ use crate::{
     model::{camera::Intrinsics, patch::Patch},
 };
 
-use super::project::{
-    EDGE_SLACK, INTEGER, INTEGER_MASK, INVERSE_DEPTH_SHIFT, NEAR_M, POSITION_BITS, STEPS, Sample,
+use super::{
+    quads::EDGE_SLACK,
+    reach::NEAR_M,
+    sample::{INTEGER, INTEGER_MASK, INVERSE_DEPTH_SHIFT, POSITION_BITS, STEPS, Sample},
 };
 
 /// What a patch reaches beyond its border, source pixels: its neighbours' vertices lie where they lie, not on the plane,

@@ -9,7 +9,8 @@ use crate::{
     model::{camera::Intrinsics, pose::Pose, viewpoint::Coarse},
     stages::interpolate::{
         gather::Source,
-        project::{ProjectScratch, Projector, Sample, draw, map_size},
+        project::{ProjectScratch, Projector, draw},
+        sample::{Sample, map_size},
     },
 };
 

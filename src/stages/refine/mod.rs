@@ -23,7 +23,7 @@ use crate::{
         pose::{Pose, PoseNoise},
         viewpoint::Coarse,
     },
-    stages::interpolate::project::{Projector, Reach},
+    stages::interpolate::{project::Projector, reach::Reach},
 };
 
 use band::{Band, HESSIAN, LevelView, Mismatch, Motion, Tukey, band_rows, divide, middle};

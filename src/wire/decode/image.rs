@@ -10,7 +10,7 @@ use crate::{
         frame::{GreyImage, RgbImage},
         refusal::Refusal,
     },
-    stages::interpolate::project::SIDE_MAX,
+    stages::interpolate::sample::SIDE_MAX,
     wire::proto::Image,
 };
 

@@ -23,7 +23,7 @@ use crate::{
         pose::{Pose, PoseNoise, pose_from_parts},
         refusal::Refusal,
     },
-    stages::interpolate::project::SIDE_MAX,
+    stages::interpolate::sample::SIDE_MAX,
 };
 
 /// The smallest picture that blocks and evidence make sense of.
