@@ -24,6 +24,7 @@
 //! takes 0.3 ms.
 
 use std::{
+    cell::RefCell,
     path::Path,
     sync::Arc,
     time::{Duration, Instant},
@@ -36,7 +37,7 @@ use surprised::{
         Memory, Slot, Version,
         store::{
             PlaceOptions, PlaceStore, Store,
-            form::{self, Label},
+            form::{self, Encoder, Label},
         },
     },
     model::{belief::Record, frame::Source, pose::Pose, viewpoint::Viewpoint},
@@ -77,6 +78,7 @@ fn main() {
                 (packed.len(), write_s, began.elapsed().as_secs_f64())
             });
         }
+        let encoder = RefCell::new(Encoder::default());
         table("the stored form, whole", &viewpoints, |viewpoint| {
             let label = Label {
                 place: "bench".to_owned(),
@@ -84,7 +86,7 @@ fn main() {
                 settings_hash: 0,
             };
             let began = Instant::now();
-            let object = form::encode(&label, viewpoint);
+            let object = encoder.borrow_mut().encode(&label, viewpoint);
             let write_s = began.elapsed().as_secs_f64();
             let began = Instant::now();
             let (_, read) = form::decode(&object, usize::MAX).expect("it was just made");
