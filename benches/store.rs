@@ -19,6 +19,11 @@
 //! differences, bytes apart, zstd 3      30.7 %  16.9     3.9         20.5 %  12.8     2.6
 //! ```
 //!
+//! Since then the table of what came before has 2^12 entries, bytes are taken apart eight records at once, and the
+//! working memory is kept: sizes are 31.3 and 21.0 %. On viewpoints of `end_to_end.py` (two sets, of which the smaller
+//! table makes 2.5 and 0.8 % more bytes), beside builds, least time of a thread: packed in 5.3 -> 3.9 ms, unpacked in
+//! 3.8 -> 2.8.
+//!
 //! Differences to the left neighbour, small ones of either sign as small numbers, do as well as those to a plane through
 //! three neighbours (32.9 %, three times as long). Level 3 of zstd takes twice the time for two percent. The checksum
 //! takes 0.3 ms.
