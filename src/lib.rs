@@ -56,5 +56,8 @@ pub mod model;
 /// Values side by side, and arithmetic on them that becomes vector code.
 pub mod lanes;
 
+/// The threads that computations share.
+pub mod pool;
+
 /// Which instructions the hot loops are compiled for.
 pub mod isa;

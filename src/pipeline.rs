@@ -4,7 +4,6 @@
 use std::{cell::OnceCell, collections::HashMap, sync::Arc};
 
 use arrayvec::ArrayVec;
-use rayon::ThreadPool;
 
 use crate::{
     config::Settings,
@@ -23,6 +22,7 @@ use crate::{
         report::Report,
         viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint},
     },
+    pool::Pool,
     stages::{
         attend::{BlockMap, Follower, Scene, regions},
         depth::{InverseDepthRange, SidesDepth, given},
@@ -100,7 +100,7 @@ struct Workspace {
 
 pub struct Pipeline {
     settings: Settings,
-    pool: Arc<ThreadPool>,
+    pool: Pool,
     sides_depth: SidesDepth,
     engine: Engine,
     refiner: PoseRefiner,
@@ -121,12 +121,13 @@ pub struct Pipeline {
 
 impl Pipeline {
     /// `pool` may be shared among places.
-    pub fn new(settings: Settings, pool: Arc<ThreadPool>) -> Self {
+    pub fn new(settings: Settings, pool: impl Into<Pool>) -> Self {
         Self::with_isa(settings, pool, Isa::detect())
     }
 
     /// With other instructions than the best; they must exist on this processor.
-    pub fn with_isa(settings: Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+    pub fn with_isa(settings: Settings, pool: impl Into<Pool>, isa: Isa) -> Self {
+        let pool = pool.into();
         let engine = Engine::Cpu(CpuEngine::new(&settings, pool.clone(), isa));
         Self::with_engine(settings, pool, isa, engine)
     }
@@ -137,7 +138,7 @@ impl Pipeline {
         Self::with_engine(settings, engines.pool().clone(), engines.isa(), engine)
     }
 
-    fn with_engine(settings: Settings, pool: Arc<ThreadPool>, isa: Isa, engine: Engine) -> Self {
+    fn with_engine(settings: Settings, pool: Pool, isa: Isa, engine: Engine) -> Self {
         Self {
             sides_depth: SidesDepth::new(depth_range(&settings), isa),
             engine,
@@ -222,6 +223,7 @@ impl Pipeline {
         frame: &Frame,
         ended: Ended,
     ) -> Result<Report, FrameError> {
+        let _computing = self.pool.begin();
         self.depth(frame)?;
         ended(Stage::Depth);
         let mut camera = match self.cameras.get_mut(&frame.source) {
@@ -347,6 +349,7 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used.
     pub fn evaluate(&mut self, frame: &Frame) -> Result<Report, FrameError> {
+        let _computing = self.pool.begin();
         self.depth(frame)?;
         let camera = self.cameras.get(&frame.source);
         let mut visit = camera
@@ -357,6 +360,7 @@ impl Pipeline {
 
     /// The prior at a pose, as somebody would see it who was not here lately.
     pub fn prior(&mut self, intrinsics: &Intrinsics, world_from_camera: &Pose) -> PriorAt {
+        let _computing = self.pool.begin();
         let mut selected = Vec::new();
         self.select(world_from_camera, &mut selected);
         let mut prior = Prior::default();
@@ -376,6 +380,7 @@ impl Pipeline {
 
     /// Goes on forgetting, over at most so many viewpoints; whether all is done.
     pub fn forget(&mut self, forgetting: &mut Forgetting, viewpoints_max: usize) -> bool {
+        let _computing = self.pool.begin();
         let memory = &mut self.memory;
         let done = self
             .pool

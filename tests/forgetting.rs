@@ -209,7 +209,7 @@ fn what_was_forgotten_is_stored_and_read_back_bit_for_bit_and_its_size_is_known(
         };
         let viewpoints = pipeline.memory().viewpoints();
         for viewpoint in viewpoints {
-            let object = form::encode(&label, viewpoint);
+            let object = form::Encoder::default().encode(&label, viewpoint);
             let (_, read) = form::decode(&object, usize::MAX).expect("it was just made");
             assert!(read == **viewpoint, "viewpoint {}", viewpoint.id);
         }

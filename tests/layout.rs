@@ -6,7 +6,7 @@ use std::{
 };
 
 /// From the outside in.
-const ROOMS: [&str; 14] = [
+const ROOMS: [&str; 15] = [
     "commands",
     "service",
     "wire",
@@ -20,6 +20,7 @@ const ROOMS: [&str; 14] = [
     "config",
     "model",
     "lanes",
+    "pool",
     "isa",
 ];
 

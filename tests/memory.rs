@@ -2,11 +2,18 @@
 
 mod reference;
 
-use reference::scene::{camera, pose, settled, viewpoint};
+use reference::{
+    Random,
+    scene::{camera, pose, settled, viewpoint},
+};
 use surprised::{
     config::{Replacement, Settings},
-    memory::{Memory, Slot, visit::Visit},
-    model::{belief::Record, pose::Pose, viewpoint::Viewpoint},
+    memory::{Memory, Slot, Version, visit::Visit},
+    model::{
+        belief::Record,
+        pose::{Pose, view_distance_m},
+        viewpoint::Viewpoint,
+    },
     stages::select::select_nearest,
 };
 
@@ -107,6 +114,47 @@ fn an_update_keeps_id_and_home_and_is_counted() {
     assert_eq!(viewpoint.world_from_camera, at(0.01));
     assert_eq!(viewpoint.updates, 4);
     assert_eq!(learn(&mut memory, 0.026, &settings), (Slot::Append, id + 1));
+}
+
+#[test]
+fn what_is_needed_at_a_pose_is_the_nearest_that_is_only_stored_nearest_first() {
+    let mut random = Random(3);
+    let mut any_pose = || {
+        let position = [0; 3].map(|_| random.uniform(-2.0, 2.0));
+        pose(position, [0; 3].map(|_| random.uniform(-1.0, 1.0)))
+    };
+    let mut memory = Memory::default();
+    let mut poses = Vec::new();
+    for index in 0..300u64 {
+        let world_from_camera = any_pose();
+        let mut viewpoint = viewpoint_at(0.0);
+        viewpoint.world_from_camera = world_from_camera;
+        viewpoint.id = index + 1;
+        let mut absent = true;
+        if index < 100 {
+            // In RAM.
+            memory.write(Slot::Append, viewpoint);
+            absent = false;
+        } else {
+            memory.know(viewpoint.head(), Version::default());
+        }
+        poses.push((index + 1, world_from_camera, absent));
+    }
+    for count in [0, 1, 14, 300, 500] {
+        let asked = any_pose();
+        let mut all: Vec<_> = poses
+            .iter()
+            .map(|(id, pose, absent)| (view_distance_m(pose, &asked, 1.0), *id, *absent))
+            .collect();
+        all.sort_by(|a, b| a.0.total_cmp(&b.0));
+        all.truncate(count);
+        let expected: Vec<u64> = all
+            .iter()
+            .filter(|view| view.2)
+            .map(|view| view.1)
+            .collect();
+        assert_eq!(memory.need(&asked, count, 1.0), expected);
+    }
 }
 
 #[test]

@@ -12,10 +12,12 @@ use surprised::{
     config::{Preset, Settings},
     model::{
         frame::{DepthSource, Frame},
+        mode::Mode,
         pose::Pose,
         report::{PixelBox, Report},
     },
-    pipeline::Pipeline,
+    pipeline::{Pipeline, Stage},
+    pool::Pool,
 };
 
 fn texture(seed: u64) -> reference::scene::Texture {
@@ -265,6 +267,41 @@ fn the_number_of_threads_and_the_instruction_set_change_no_bit_of_what_is_learnt
         let alike = |pair: &[Robot]| same_memory(&pair[0].pipeline, &pair[1].pipeline);
         assert!(robots.windows(2).all(alike));
     }
+}
+
+#[test]
+fn how_many_others_compute_says_on_which_thread_a_frame_is_but_nothing_of_what_is_learnt() {
+    let pool = Pool::from(pool(2));
+    let here = std::thread::current().id();
+    let mut pipelines = [(); 3].map(|()| Pipeline::new(Settings::robust(), pool.clone()));
+    for step in 0..STEPS {
+        let frame = frame(&place(step > STEPS / 2), &arc(step, 0.002), step as u64 + 1);
+        let mut others = Vec::new();
+        let mut reports = Vec::new();
+        for (pipeline, on_own_thread) in pipelines.iter_mut().zip([
+            false, // It has both threads of the pool.
+            true,  // The other thread has enough to do.
+            false, // It takes turns with the others at the pool's.
+        ]) {
+            let mut thread = None;
+            let mut ended = |stage| {
+                if stage == Stage::Refine {
+                    thread = Some(std::thread::current().id());
+                }
+            };
+            let report = pipeline.process_staged(Mode::Learn, &frame, &mut ended);
+            reports.push(report.expect("a good frame"));
+            let is_here = thread.expect("it was refined") == here;
+            assert_eq!(is_here, on_own_thread, "beside {} others", others.len());
+            others.push(pool.begin());
+        }
+        assert!(reports.windows(2).all(|pair| pair[0] == pair[1]));
+    }
+    assert!(
+        pipelines
+            .windows(2)
+            .all(|pair| same_memory(&pair[0], &pair[1]))
+    );
 }
 
 #[test]

@@ -6,9 +6,6 @@ pub mod gpu;
 
 use std::sync::Arc;
 
-use arrayvec::ArrayVec;
-use rayon::ThreadPool;
-
 use crate::{
     config::{Evidence, Settings},
     isa::Isa,
@@ -19,12 +16,14 @@ use crate::{
         pose::{Pose, PoseNoise},
         viewpoint::{Coarse, Mesh, MeshCut, Viewpoint},
     },
+    pool::Pool,
     stages::{
         attend::BlockMap,
         interpolate::prior::Prior,
         refine::{PoseRefiner, REFINE_VIEWS, Refined},
     },
 };
+use arrayvec::ArrayVec;
 
 use self::{
     cpu::{CpuEngine, Observation, RecallView, Score},
@@ -101,14 +100,14 @@ pub enum Engine {
 pub struct Engines {
     /// `None`: the processor alone.
     card: Option<Arc<Card>>,
-    pool: Arc<ThreadPool>,
+    pool: Pool,
     isa: Isa,
 }
 
 impl Engines {
     /// # Errors
     /// `Gpu` was asked for and there is none.
-    pub fn new(kind: EngineKind, pool: Arc<ThreadPool>, isa: Isa) -> Result<Self, EngineError> {
+    pub fn new(kind: EngineKind, pool: impl Into<Pool>, isa: Isa) -> Result<Self, EngineError> {
         let card = match kind {
             EngineKind::Cpu => None,
             EngineKind::Gpu => Some(Card::open(CardRules::any())?),
@@ -121,21 +120,25 @@ impl Engines {
                 }
             },
         };
-        Ok(Self { card, pool, isa })
+        Ok(Self {
+            card,
+            pool: pool.into(),
+            isa,
+        })
     }
 
     /// On a card that was chosen otherwise.
-    pub fn on(card: Arc<Card>, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+    pub fn on(card: Arc<Card>, pool: impl Into<Pool>, isa: Isa) -> Self {
         Self {
             card: Some(card),
-            pool,
+            pool: pool.into(),
             isa,
         }
     }
 
     /// A place's.
     pub fn engine(&self, settings: &Settings) -> Engine {
-        let pool = Arc::clone(&self.pool);
+        let pool = self.pool.clone();
         match &self.card {
             Some(card) if card.works() || !card.falls_back() => {
                 Engine::Gpu(Box::new(GpuEngine::new(card, settings, pool, self.isa)))
@@ -148,7 +151,7 @@ impl Engines {
         self.card.as_deref()
     }
 
-    pub fn pool(&self) -> &Arc<ThreadPool> {
+    pub fn pool(&self) -> &Pool {
         &self.pool
     }
 

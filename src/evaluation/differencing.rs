@@ -4,10 +4,6 @@
 //! pixel is the sum of absolute differences over Y, Cb and Cr. Views, warps and the replacement rule are those of the
 //! settings under test, so that only the probabilities differ.
 
-use std::sync::Arc;
-
-use rayon::ThreadPool;
-
 use crate::{
     config::{Evidence, Settings},
     engine::cpu::{CpuEngine, Observation, RecallView},
@@ -20,6 +16,7 @@ use crate::{
         pose::{Pose, PoseNoise},
         viewpoint::{Coarse, Mesh, Viewpoint},
     },
+    pool::Pool,
     stages::{
         attend::{BlockMap, Scene, regions},
         exposure::exposure_gain,
@@ -77,7 +74,7 @@ pub struct Differencing {
 
 impl Differencing {
     /// `settings` give views, mesh, memory and regions.
-    pub fn new(settings: &Settings, helps: Helps, pool: Arc<ThreadPool>) -> Self {
+    pub fn new(settings: &Settings, helps: Helps, pool: Pool) -> Self {
         let settings = Settings {
             depth_vote: helps.depth_vote,
             colour_vote: false,

@@ -116,27 +116,28 @@ impl Memory {
             Here(usize),
             Absent(u64),
         }
-        let distance_m = |view: &Pose| view_distance_m(view, world_from_camera, metres_per_radian);
-        let here = self
-            .viewpoints
-            .iter()
-            .enumerate()
-            .map(|(index, viewpoint)| {
-                let distance_m = distance_m(&viewpoint.world_from_camera);
-                (distance_m, Where::Here(index))
-            });
-        let absent = self.absent.iter().map(|(&id, absent)| {
-            let distance_m = distance_m(&absent.head.world_from_camera);
-            (distance_m, Where::Absent(id))
-        });
-        let mut all: Vec<(f64, Where)> = here.chain(absent).collect();
-        if count < all.len() {
-            all.select_nth_unstable_by(count, |a, b| a.0.total_cmp(&b.0));
-            all.truncate(count);
+        let here = self.viewpoints.iter().enumerate();
+        let here = here.map(|(index, view)| (&view.world_from_camera, Where::Here(index)));
+        let absent = self.absent.iter();
+        let absent = absent.map(|(&id, view)| (&view.head.world_from_camera, Where::Absent(id)));
+        let mut nearest: Vec<(f64, Where)> = Vec::with_capacity(count + 1);
+        let position = world_from_camera.translation.vector;
+        for (view, place) in here.chain(absent) {
+            let farthest_m = match nearest.last() {
+                Some(last) if nearest.len() >= count => last.0,
+                _ => f64::INFINITY,
+            };
+            // Of a large place's viewpoints nearly all are too far by their position alone.
+            if (view.translation.vector - position).norm_squared() >= farthest_m * farthest_m {
+                continue;
+            }
+            let distance_m = view_distance_m(view, world_from_camera, metres_per_radian);
+            let rank = nearest.partition_point(|near| near.0 <= distance_m);
+            nearest.insert(rank, (distance_m, place));
+            nearest.truncate(count);
         }
-        all.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut needed = Vec::new();
-        for (_, place) in all {
+        for (_, place) in nearest {
             match place {
                 Where::Here(index) => self.marks[index].used = self.turn,
                 Where::Absent(id) => needed.push(id),

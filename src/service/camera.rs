@@ -59,6 +59,7 @@ pub struct Camera {
     remembered: Option<Arc<Lenses>>,
     /// Markers whose plate is not known yet: stamps and positions in the world.
     markers: VecDeque<(i64, MarkersInWorld)>,
+    /// Since when the robot is being asked for its calibration, or was in vain.
     calibration_asked: Option<Instant>,
     order: StampOrder,
     /// Sequence of the last frame that could be read, refused or not.
@@ -187,6 +188,13 @@ impl Camera {
         match Lenses::new(calibration.clone(), limits) {
             Ok(lenses) => self.remembered = Some(Arc::new(lenses)),
             Err(refusal) => tracing::warn!("a stored calibration is not used: {refusal}"),
+        }
+    }
+
+    /// The robot was asked for its calibration, and nobody answers any more.
+    pub fn calibration_asked(&mut self) {
+        if self.calibration.is_none() {
+            self.calibration = self.remembered.take();
         }
     }
 

@@ -48,6 +48,8 @@ pub enum Aside {
     /// The plate's markers, from which a pose follows.
     Markers(ZBytes),
     Calibration(ZBytes),
+    /// The robot was asked for it; whoever wanted to answer has.
+    CalibrationAsked,
     Mode(Mode),
     /// Not even worth decoding; the key's leaf on which it came.
     Refused(&'static str, Refusal),
@@ -91,6 +93,7 @@ struct Slot {
     /// Poses and markers, in the order they came.
     poses: VecDeque<Aside>,
     calibration: Option<ZBytes>,
+    calibration_asked: bool,
     mode: Option<Mode>,
     refused: VecDeque<(&'static str, Refusal)>,
     live: bool,
@@ -162,6 +165,7 @@ impl Inbox {
             replaced_since_taken: 0,
             poses: VecDeque::new(),
             calibration: None,
+            calibration_asked: false,
             mode: None,
             refused: VecDeque::new(),
             live: false,
@@ -203,6 +207,7 @@ impl Inbox {
                 slot.poses.push_back(aside);
             }
             Aside::Calibration(payload) => slot.calibration = Some(payload),
+            Aside::CalibrationAsked => slot.calibration_asked = true,
             Aside::Mode(mode) => slot.mode = Some(mode),
             Aside::Refused(leaf, refusal) => {
                 if slot.refused.len() == REFUSALS_MAX {
@@ -393,13 +398,15 @@ impl State {
         };
         for (source, slot) in &mut self.cameras {
             let calibration = slot.calibration.take().map(Aside::Calibration);
+            let asked = std::mem::take(&mut slot.calibration_asked);
+            let asked = asked.then_some(Aside::CalibrationAsked);
             let mode = slot.mode.take().map(Aside::Mode);
             let poses = slot.poses.drain(..);
             let refused = slot
                 .refused
                 .drain(..)
                 .map(|(leaf, refusal)| Aside::Refused(leaf, refusal));
-            let asides = calibration.into_iter().chain(mode);
+            let asides = calibration.into_iter().chain(asked).chain(mode);
             for aside in asides.chain(poses).chain(refused) {
                 delivery.asides.push((source.clone(), aside));
             }

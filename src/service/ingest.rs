@@ -359,7 +359,10 @@ pub fn calibration_getter(
     inbox: Arc<Inbox>,
 ) -> Box<dyn Fn(&CameraPath) + Send> {
     Box::new(move |path| {
-        let (inbox, source) = (inbox.clone(), path.source.clone());
+        let answers = CalibrationAnswers {
+            inbox: inbox.clone(),
+            source: path.source.clone(),
+        };
         let got = session
             .get(path.key(&root, keys::CALIBRATION))
             .timeout(CALIBRATION_WAIT)
@@ -368,17 +371,34 @@ pub fn calibration_getter(
                 let Ok(sample) = reply.result() else {
                     return;
                 };
-                let aside = match checked_payload(keys::CALIBRATION, sample, 1 << 20) {
+                answers.put(match checked_payload(keys::CALIBRATION, sample, 1 << 20) {
                     Ok(payload) => Aside::Calibration(payload),
                     Err(refusal) => Aside::Refused(keys::CALIBRATION, refusal),
-                };
-                if let Err(refusal) = inbox.put_aside(&source, aside) {
-                    tracing::debug!("calibration not taken: {refusal}");
-                }
+                });
             })
             .wait();
         if let Err(error) = got {
             tracing::debug!("no get for a calibration: {error}");
         }
     })
+}
+
+/// Says that it was the last when it ends: at once where nobody answers such gets.
+struct CalibrationAnswers {
+    inbox: Arc<Inbox>,
+    source: Source,
+}
+
+impl CalibrationAnswers {
+    fn put(&self, aside: Aside) {
+        if let Err(refusal) = self.inbox.put_aside(&self.source, aside) {
+            tracing::debug!("calibration not taken: {refusal}");
+        }
+    }
+}
+
+impl Drop for CalibrationAnswers {
+    fn drop(&mut self) {
+        self.put(Aside::CalibrationAsked);
+    }
 }

@@ -1,11 +1,11 @@
 //! What holds wherever viewpoints are stored.
 
-use std::collections::BTreeMap;
+use std::{collections::BTreeMap, time::Duration};
 
 use futures_util::TryStreamExt;
 use object_store::{ObjectMeta, ObjectStoreExt, path::Path};
 use surprised::{
-    memory::store::{Role, form},
+    memory::store::{PlaceOptions, Role, form},
     model::{
         frame::Source,
         mode::{Mode, Modes},
@@ -13,7 +13,7 @@ use surprised::{
     },
 };
 
-use super::rig::{Backend, PLACE, STEP_M, Service};
+use super::rig::{Backend, PLACE, STEP_M, Service, options};
 
 macro_rules! on_every_backend {
     ($($promise:ident,)*) => {
@@ -32,6 +32,8 @@ on_every_backend! {
     what_was_learnt_is_there_after_a_stop_bit_for_bit,
     what_was_learnt_is_stored_without_a_stop,
     only_the_newest_state_is_kept,
+    what_changed_later_may_change_again_before_it_is_written,
+    nothing_goes_before_what_came_in_its_room_is_stored,
     what_was_removed_stays_removed,
     a_damaged_viewpoint_is_set_aside_and_named_and_the_others_are_there,
     objects_that_are_none_are_set_aside,
@@ -129,6 +131,56 @@ fn only_the_newest_state_is_kept(backend: &Backend) {
     service.stop();
     assert_eq!(objects_below(backend, "viewpoints").len(), 1);
     assert_eq!(recovered(backend, 1), learnt);
+}
+
+/// Long enough for what is done at once to be done, on a busy machine too.
+fn slowly() -> PlaceOptions {
+    PlaceOptions {
+        write_behind: Duration::from_secs(4),
+        ..options()
+    }
+}
+
+fn slow_writer(backend: &Backend) -> Service {
+    let mut service = Service::with(&backend.store(), PLACE, slowly());
+    service.until("it writes the place", |service| {
+        service.store.role() == Role::Writer
+    });
+    service
+}
+
+fn what_changed_later_may_change_again_before_it_is_written(backend: &Backend) {
+    let mut service = slow_writer(backend);
+    service.learn(0.0, 1);
+    std::thread::sleep(slowly().write_behind_half() / 2);
+    service.learn(STEP_M, 2);
+    service.until("the first is stored, and the batch it was in", |service| {
+        let status = service.store.status();
+        status.written > 0 && status.pending < 2
+    });
+    assert_eq!(service.store.status().written, 1);
+    service.learn(STEP_M, 3);
+    service.until_stored();
+    let status = service.store.status();
+    assert_eq!((status.written, status.late), (2, 0));
+    let learnt = service.content();
+    service.crash();
+    assert_eq!(recovered(backend, 2), learnt);
+}
+
+fn nothing_goes_before_what_came_in_its_room_is_stored(backend: &Backend) {
+    let mut service = slow_writer(backend);
+    service.learn_row(2);
+    service.until_stored();
+    // It changes, and is removed for another much later.
+    service.learn(0.0, 3);
+    std::thread::sleep(slowly().write_behind_half() / 2);
+    assert_eq!(service.memory.remove(|head| head.id == 1), 1);
+    service.learn(5.0 * STEP_M, 4);
+    service.until("one is gone", |service| service.store.status().removed == 1);
+    service.crash();
+    let left = recovered(backend, 2);
+    assert_eq!(left.into_keys().collect::<Vec<_>>(), [2, 3]);
 }
 
 fn what_was_removed_stays_removed(backend: &Backend) {

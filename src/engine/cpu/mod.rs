@@ -4,10 +4,10 @@ mod score;
 
 mod strips;
 
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Mutex, MutexGuard};
 
 use arrayvec::ArrayVec;
-use rayon::{ThreadPool, prelude::*};
+use rayon::prelude::*;
 
 use crate::{
     config::Settings,
@@ -19,6 +19,7 @@ use crate::{
         pose::Pose,
         viewpoint::{Coarse, Mesh, MeshCut, VIEWS_MAX, Viewpoint, halve_luminance},
     },
+    pool::Pool,
     stages::{
         exposure::ExposureRatios,
         interpolate::{
@@ -153,7 +154,7 @@ struct Scratch {
 }
 
 pub struct CpuEngine {
-    pool: Arc<ThreadPool>,
+    pool: Pool,
     isa: Isa,
     merge_rules: MergeRules,
     score_rules: ScoreRules,
@@ -166,7 +167,8 @@ pub struct CpuEngine {
 
 impl CpuEngine {
     /// `pool` may be shared among engines.
-    pub fn new(settings: &Settings, pool: Arc<ThreadPool>, isa: Isa) -> Self {
+    pub fn new(settings: &Settings, pool: impl Into<Pool>, isa: Isa) -> Self {
+        let pool = pool.into();
         let update = UpdateRules::new(settings);
         let scratch = (0..pool.current_num_threads())
             .map(|_| Mutex::default())
@@ -492,7 +494,7 @@ impl CpuEngine {
 
     /// Several passes, handed over once.
     pub fn in_pool<T: Send>(&self, passes: impl FnOnce() -> T + Send) -> T {
-        if self.is_alone() {
+        if self.is_alone() && !self.pool.is_crowded() {
             passes()
         } else {
             self.pool.install(passes)
@@ -504,13 +506,13 @@ impl CpuEngine {
         (STRIP_PIXELS / width.max(1)).clamp(1, most)
     }
 
-    /// With one thread the caller's does the work: handing it over and back would take longer than some strips.
+    /// Whether one thread does the work.
     fn is_alone(&self) -> bool {
-        self.pool.current_num_threads() == 1
+        self.pool.is_taken()
     }
 
     fn thread_scratch(&self) -> MutexGuard<'_, Scratch> {
-        // The caller's own thread where there is only one.
+        // Whoever works alone is of none, or the only one at work here.
         let thread = self.pool.current_thread_index().unwrap_or(0);
         locked(&self.scratch[thread])
     }

@@ -60,8 +60,6 @@ pub mod residency;
 
 use std::sync::Arc;
 
-use rayon::ThreadPool;
-
 use self::{
     card::Card,
     frame::{Failure, State, Wanted},
@@ -75,6 +73,7 @@ use crate::{
     config::Settings,
     isa::Isa,
     model::{camera::Intrinsics, pose::Pose, viewpoint::Viewpoint},
+    pool::Pool,
     stages::interpolate::prior::Prior,
 };
 
@@ -107,25 +106,20 @@ pub struct GpuEngine {
     state: State,
     /// For what does not fit the device.
     processor: CpuEngine,
-    pool: Arc<ThreadPool>,
+    pool: Pool,
     isa: Isa,
     counters: Counters,
 }
 
 impl GpuEngine {
-    pub(super) fn new(
-        card: &Arc<Card>,
-        settings: &Settings,
-        pool: Arc<ThreadPool>,
-        isa: Isa,
-    ) -> Self {
+    pub(super) fn new(card: &Arc<Card>, settings: &Settings, pool: Pool, isa: Isa) -> Self {
         let rules = Rules::new(settings);
         Self {
             state: State::new(card.device(), &rules, settings.views, card.share()),
             settings: settings.clone(),
             card: Arc::clone(card),
             rules,
-            processor: CpuEngine::new(settings, Arc::clone(&pool), isa),
+            processor: CpuEngine::new(settings, pool.clone(), isa),
             pool,
             isa,
             counters: Counters::default(),
@@ -152,7 +146,7 @@ impl GpuEngine {
 
     /// The engine that takes over.
     pub(super) fn fallback(&self) -> CpuEngine {
-        CpuEngine::new(&self.settings, Arc::clone(&self.pool), self.isa)
+        CpuEngine::new(&self.settings, self.pool.clone(), self.isa)
     }
 
     pub(super) fn compare(

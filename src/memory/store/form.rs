@@ -29,7 +29,7 @@
 
 use nalgebra::{Quaternion, Translation3, UnitQuaternion};
 
-use super::planes;
+use super::planes::{self, Packer};
 use crate::{
     memory::Version,
     model::{
@@ -100,10 +100,20 @@ pub fn checksum(bytes: &[u8]) -> u64 {
     crc_fast::crc64_nvme(bytes)
 }
 
-/// The whole object.
-pub fn encode(label: &Label, viewpoint: &Viewpoint) -> Vec<u8> {
-    let planes = planes::pack(&viewpoint.records, &viewpoint.mesh.depth_m);
-    assemble(label, &viewpoint.head(), viewpoint.mesh.joined, &planes)
+/// Keeps its working memory from one viewpoint to the next.
+#[derive(Default)]
+pub struct Encoder {
+    packer: Packer,
+}
+
+impl Encoder {
+    /// The whole object.
+    pub fn encode(&mut self, label: &Label, viewpoint: &Viewpoint) -> Vec<u8> {
+        let planes = self
+            .packer
+            .pack(&viewpoint.records, &viewpoint.mesh.depth_m);
+        assemble(label, &viewpoint.head(), viewpoint.mesh.joined, planes)
+    }
 }
 
 /// The same viewpoint under another label; its planes are not touched.

@@ -1,7 +1,11 @@
-//! Writes what has changed, some time after it changed: newest states only, several at once. What is said about modes is
-//! written at once.
+//! Writes what has changed, some time after it changed: newest states only, several at once. What changes again and again
+//! is written once in that time. What is said about modes is written at once.
 
-use std::{collections::BTreeMap, sync::Arc, time::Instant};
+use std::{
+    collections::BTreeMap,
+    sync::{Arc, Mutex, PoisonError},
+    time::Instant,
+};
 
 use bytes::Bytes;
 use futures_util::{StreamExt, stream};
@@ -9,7 +13,7 @@ use tokio::{task::spawn_blocking, time};
 
 use super::{
     Backoff,
-    form::{self, Label},
+    form::{Encoder, Label},
     modes,
     notes::{self, Kind},
     shared::{Known, News, Pending, Role, Shared},
@@ -47,16 +51,20 @@ pub async fn write(shared: Arc<Shared>) {
     let mut backoff = Backoff::default();
     // Earlier states that are still there.
     let mut superseded = Vec::new();
+    let encoders = Encoders::default();
     loop {
         match due(&shared) {
             Due::End => return,
-            Due::Nothing => shared.for_writer.notified().await,
+            Due::Nothing => {
+                encoders.clear();
+                shared.for_writer.notified().await;
+            }
             Due::At(instant) => {
                 // Whichever comes first.
                 let _ = time::timeout_at(instant.into(), shared.for_writer.notified()).await;
             }
             Due::Batch { epoch, changes } => {
-                if write_batch(&shared, epoch, changes, &mut superseded).await {
+                if write_batch(&shared, epoch, changes, &mut superseded, &encoders).await {
                     backoff = Backoff::default();
                 } else {
                     time::sleep(backoff.next()).await;
@@ -135,7 +143,16 @@ fn due(shared: &Shared) -> Due {
             };
         }
     }
-    let changes: Vec<(u64, Pending)> = std::mem::take(&mut state.pending).into_iter().collect();
+    let (closing, now) = (state.closing, Instant::now());
+    let is_due = |pending: &Pending| closing || pending.since + write_behind <= now;
+    // What changed later may change again before it has to be written. But nothing goes before what came in its room is
+    // stored: that may be all that is known there.
+    let mut pending = state.pending.values();
+    let all = pending.any(|pending| pending.written.is_none() && is_due(pending));
+    let changes: Vec<(u64, Pending)> = state
+        .pending
+        .extract_if(.., |_, pending| all || is_due(pending))
+        .collect();
     state.writing = changes.len();
     Due::Batch { epoch, changes }
 }
@@ -166,12 +183,36 @@ async fn write_modes(shared: &Shared, version: Version, said: Modes) -> shelf::R
     Ok(())
 }
 
+/// At most as many as are in use at once, kept as long as there is something to be written.
+#[derive(Default)]
+struct Encoders(Mutex<Vec<Encoder>>);
+
+impl Encoders {
+    fn take(&self) -> Encoder {
+        let idle = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        idle.unwrap_or_default()
+    }
+
+    fn put_back(&self, encoder: Encoder) {
+        let mut idle = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        idle.push(encoder);
+    }
+
+    fn clear(&self) {
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clear();
+    }
+}
+
 /// False if some of it failed; that is pending again.
 async fn write_batch(
     shared: &Arc<Shared>,
     epoch: u64,
     changes: Vec<(u64, Pending)>,
     superseded: &mut Vec<(u64, Version)>,
+    encoders: &Encoders,
 ) -> bool {
     let (written, removed): (Vec<_>, Vec<_>) = changes
         .into_iter()
@@ -179,7 +220,7 @@ async fn write_batch(
     let mut trouble = None;
     let mut writes = stream::iter(written)
         .map(|(id, pending)| async move {
-            let done = write_one(shared, epoch, &pending).await;
+            let done = write_one(shared, epoch, &pending, encoders).await;
             (id, pending, done)
         })
         .buffer_unordered(WRITES_AT_ONCE);
@@ -228,6 +269,7 @@ async fn write_one(
     shared: &Arc<Shared>,
     epoch: u64,
     pending: &Pending,
+    encoders: &Encoders,
 ) -> shelf::Result<Option<Known>> {
     let Some((viewpoint, revision)) = pending.written.clone() else {
         return Ok(None);
@@ -239,8 +281,10 @@ async fn write_one(
         settings_hash: shared.options.settings_hash,
     };
     let (head, id) = (viewpoint.head(), viewpoint.id);
-    let packed = spawn_blocking(move || form::encode(&label, &viewpoint)).await;
-    let object = packed.map_err(|source| object_store::Error::JoinError { source })?;
+    let mut encoder = encoders.take();
+    let packed = spawn_blocking(move || (encoder.encode(&label, &viewpoint), encoder)).await;
+    let (object, encoder) = packed.map_err(|source| object_store::Error::JoinError { source })?;
+    encoders.put_back(encoder);
     if !shared.lock().may_write(epoch) {
         return Ok(None);
     }

@@ -72,6 +72,7 @@ impl Desk {
                     .and_then(|message| decode::calibration(&message))
                     .and_then(|calibration| camera.set_calibration(calibration, limits)),
             ),
+            Aside::CalibrationAsked => return camera.calibration_asked(),
             Aside::Mode(_) => (keys::MODE, set),
             Aside::Refused(leaf, refusal) => (leaf, Err(refusal)),
         };

@@ -9,11 +9,9 @@ mod band;
 
 mod level;
 
-use std::sync::Arc;
-
 use arrayvec::ArrayVec;
 use nalgebra::{Isometry3, SMatrix, SVector, Translation3, UnitQuaternion, Vector3};
-use rayon::{ThreadPool, prelude::*};
+use rayon::prelude::*;
 
 use crate::{
     isa::Isa,
@@ -23,6 +21,7 @@ use crate::{
         pose::{Pose, PoseNoise},
         viewpoint::Coarse,
     },
+    pool::Pool,
     stages::interpolate::{project::Projector, reach::Reach},
 };
 
@@ -177,7 +176,7 @@ impl Estimate {
 pub struct PoseRefiner {
     isa: Isa,
     /// `None`: the caller's thread alone.
-    pool: Option<Arc<ThreadPool>>,
+    pool: Option<Pool>,
     work: Work,
 }
 
@@ -229,10 +228,10 @@ impl Default for PoseRefiner {
 
 impl PoseRefiner {
     /// `pool` may be shared.
-    pub fn new(pool: Arc<ThreadPool>, isa: Isa) -> Self {
+    pub fn new(pool: impl Into<Pool>, isa: Isa) -> Self {
         Self {
             isa,
-            pool: (pool.current_num_threads() > 1).then_some(pool),
+            pool: Some(pool.into()),
             work: Work::default(),
         }
     }
@@ -247,9 +246,10 @@ impl PoseRefiner {
         world_from_camera: &Pose,
         noise: PoseNoise,
     ) -> Refined {
+        let pool = self.pool.as_ref().filter(|pool| !pool.is_taken());
         let crew = Crew {
             isa: self.isa,
-            is_alone: self.pool.is_none(),
+            is_alone: pool.is_none(),
         };
         let question = Question {
             views: &views[..views.len().min(REFINE_VIEWS)],
@@ -259,7 +259,7 @@ impl PoseRefiner {
             noise: believed(noise),
         };
         let work = &mut self.work;
-        let refined = match &self.pool {
+        let refined = match pool {
             Some(pool) => pool.install(|| work.refine(crew, &question)),
             None => work.refine(crew, &question),
         };
