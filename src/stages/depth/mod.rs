@@ -63,7 +63,6 @@ impl Default for DepthSettings {
             sweep: SweepSettings {
                 most_difference: 16,
                 occlusion: 5,
-                most_surprise: 2,
                 unseen: 6,
             },
             weak_texture: 15,
@@ -110,7 +109,7 @@ pub const SEEN_BY_RIGHT: u8 = 2;
 pub struct DepthMap {
     /// Metres along the optical axis; 0 = nothing can be said.
     pub depth_m: Vec<f32>,
-    /// From 0, another depth is as likely, to 1.
+    /// Of what the images say: from 0, another depth is as likely, to 1.
     pub confidence: Vec<f32>,
     /// Which sides see the pixel: [`SEEN_BY_LEFT`], [`SEEN_BY_RIGHT`].
     pub seen_by: Vec<u8>,
@@ -157,8 +156,8 @@ impl DepthEstimator {
     }
 
     /// Depth of the middle image, RGB, from the sides' luminances, of the sizes that the rig says; that of a side the rig
-    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) decides where the images leave it open: all
-    /// hypotheses of `range` are tried at every pixel, so that nothing new stays hidden behind an expectation.
+    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) is taken where the images leave it open,
+    /// and only there: nothing new stays hidden behind an expectation, and no mistake that was remembered confirms itself.
     pub fn estimate(
         &mut self,
         rig: &DepthRig,
@@ -233,9 +232,8 @@ impl DepthEstimator {
             weak: self
                 .textures
                 .find_weak(middle_y, width, settings.weak_texture),
-            expected_depth_m,
         };
-        let highest = settings.sweep.highest_cost();
+        let highest = settings.sweep.most_difference;
         let sides = turned(rig, &self.sides);
         let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range, false);
         propagation.fill_coarse(
@@ -285,24 +283,32 @@ impl DepthEstimator {
         map.depth_m.resize(pixels, 0.0);
         map.confidence.resize(pixels, 0.0);
         let certain = f32::from(settings.sweep.most_difference);
+        let expected_depth_m = expected_depth_m.unwrap_or(&[]);
         let outputs = map
             .depth_m
             .par_iter_mut()
             .zip(&mut map.confidence)
             .zip(&mut map.inverse_depth)
             .with_min_len(4096);
-        outputs.zip(beliefs).zip(&map.seen_by).for_each(
-            |((((depth_m, confidence), label), belief), seen_by)| {
-                let inverse_depth = range.far as f32 + *label * range.step() as f32;
-                *label = inverse_depth;
+        outputs.zip(beliefs).zip(&map.seen_by).enumerate().for_each(
+            |(pixel, ((((depth_m, confidence), label), belief), seen_by))| {
+                let mut inverse_depth = range.far as f32 + *label * range.step() as f32;
                 let margin = f32::from(belief.rival_cost - belief.cost);
                 *confidence = if *seen_by == 0 {
                     0.0
                 } else {
                     (margin / certain).min(1.0)
                 };
+                let mut is_known = *confidence > 0.0;
+                if !is_known
+                    && let Some(expected_m) = expected_depth_m.get(pixel).filter(|z| **z > 0.0)
+                {
+                    inverse_depth = 1.0 / expected_m;
+                    is_known = true;
+                }
+                *label = inverse_depth;
                 // Infinitely far is no depth either.
-                *depth_m = if *confidence > 0.0 && inverse_depth > 0.0 {
+                *depth_m = if is_known && inverse_depth > 0.0 {
                     1.0 / inverse_depth
                 } else {
                     0.0
