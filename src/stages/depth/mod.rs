@@ -50,6 +50,8 @@ pub struct DepthSettings {
     pub sweep: SweepSettings,
     /// Mean difference between neighbours, half grey levels, up to which differences between cameras count three times.
     pub weak_texture: u8,
+    /// Likewise, up to which there is nothing but noise to compare, and what is expected has a vote.
+    pub blank_texture: u8,
     /// Margin, grey levels, from which a belief hides what is behind it from the sides.
     pub firm: u8,
     /// Between neighbours of like colour; the step is for a shift of one pixel between cameras, however many labels
@@ -71,9 +73,11 @@ impl Default for DepthSettings {
             sweep: SweepSettings {
                 most_difference: 16,
                 occlusion: 6,
+                most_surprise: 2,
                 unseen: 7,
             },
             weak_texture: 20,
+            blank_texture: 5,
             firm: 28,
             smooth: Smoothness {
                 step: 7,
@@ -167,8 +171,9 @@ impl DepthEstimator {
     }
 
     /// Depth of the middle image, RGB, from the sides' luminances, of the sizes that the rig says; that of a side the rig
-    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) is taken where the images leave it open,
-    /// and only there: nothing new stays hidden behind an expectation, and no mistake that was remembered confirms itself.
+    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) decides where the images are blank or
+    /// leave it open, and only there: all hypotheses of `range` are tried at every pixel, so that nothing new stays hidden
+    /// behind an expectation, and no mistake that was remembered confirms itself.
     pub fn estimate(
         &mut self,
         rig: &DepthRig,
@@ -232,14 +237,20 @@ impl DepthEstimator {
             BeliefPropagation::new(kind.3, width, height, range.labels, isa)
         });
         propagation.set_contrasts(contrasts.levels());
+        let textures = &mut self.textures;
+        textures.find(
+            middle_y,
+            width,
+            [settings.weak_texture, settings.blank_texture],
+        );
         let middle = Middle {
             intrinsics: &rig.middle,
             luminance: middle_y,
-            weak: self
-                .textures
-                .find_weak(middle_y, width, settings.weak_texture),
+            weak: textures.weak(),
+            blank: textures.blank(),
+            expected_depth_m,
         };
-        let highest = settings.sweep.most_difference;
+        let highest = settings.sweep.highest_cost();
         let sides = turned(rig, &self.sides);
         let sweep = Sweep::new(isa, &settings.sweep, middle, sides, range, false);
         propagation.fill_coarse(

@@ -22,8 +22,18 @@ pub struct SweepSettings {
     pub most_difference: u8,
     /// Grey levels that seeing a point from one side only costs.
     pub occlusion: u8,
+    /// The most that a label far from the expected depth costs, grey levels: far less than `most_difference`, so that
+    /// it decides where the images do not, and never against them.
+    pub most_surprise: u8,
     /// What a label costs that neither side could see, grey levels.
     pub unseen: u8,
+}
+
+impl SweepSettings {
+    /// No cost exceeds it.
+    pub fn highest_cost(&self) -> u8 {
+        self.most_difference.saturating_add(self.most_surprise)
+    }
 }
 
 /// The middle image and what is known of it.
@@ -33,6 +43,10 @@ pub(super) struct Middle<'a> {
     pub luminance: &'a [u8],
     /// 255 where a difference counts three times, else 0.
     pub weak: &'a [u8],
+    /// 255 where it has a vote what is expected, else 0.
+    pub blank: &'a [u8],
+    /// Metres, 0 = none.
+    pub expected_depth_m: Option<&'a [f32]>,
 }
 
 /// Everything that the rows of one frame share.
@@ -53,6 +67,7 @@ pub(super) struct Scratch {
     strips: [Strip; 2],
     luminance: Vec<u8>,
     weak: Vec<u8>,
+    expected: Vec<u8>,
 }
 
 impl<'a> Sweep<'a> {
@@ -90,7 +105,8 @@ impl<'a> Sweep<'a> {
         Scratch {
             strips: [0, 1].map(|side| self.samplers[side].strip(self.range.labels, &self.board)),
             luminance: line.clone(),
-            weak: line,
+            weak: line.clone(),
+            expected: line,
         }
     }
 
@@ -106,6 +122,7 @@ impl<'a> Sweep<'a> {
             strips,
             luminance,
             weak,
+            expected,
         } = scratch;
         let labels = range.labels;
         for (sampler, strip) in self.samplers.iter().zip(strips.iter_mut()) {
@@ -126,9 +143,26 @@ impl<'a> Sweep<'a> {
             for (to, from) in weak.iter_mut().zip(here.step_by(2)) {
                 *to = *from;
             }
+            if let Some(depth_m) = middle.expected_depth_m {
+                let here = depth_m[pixels.clone()]
+                    .iter()
+                    .zip(&middle.blank[pixels.clone()]);
+                let here = here.skip(parity).step_by(2);
+                for (to, (depth_m, blank)) in expected.iter_mut().zip(here) {
+                    *to = if *depth_m > 0.0 && *blank != 0 {
+                        range
+                            .label_of_depth(f64::from(*depth_m))
+                            .round()
+                            .clamp(0.0, labels as f64 - 1.0) as u8
+                    } else {
+                        NOT_EXPECTED
+                    };
+                }
+            }
             let half_row = HalfRow {
                 luminance,
                 weak,
+                expected: middle.expected_depth_m.map(|_| &expected[..]),
                 strips,
                 parity,
                 tolerance: self.tolerance,
@@ -154,9 +188,13 @@ impl<'a> Sweep<'a> {
     }
 }
 
+/// Label that stands for an unknown depth; a range of 256 labels loses its nearest as an expectation.
+const NOT_EXPECTED: u8 = 255;
+
 struct HalfRow<'a> {
     luminance: &'a [u8],
     weak: &'a [u8],
+    expected: Option<&'a [u8]>,
     strips: &'a [Strip; 2],
     parity: usize,
     /// Labels by which a blocker must be nearer.
@@ -170,6 +208,7 @@ impl HalfRow<'_> {
         let reach = self.board.half.max(32);
         assert!(self.luminance.len() >= reach && costs.len() >= labels * self.board.stride);
         assert!(self.weak.len() >= reach);
+        assert!(self.expected.is_none_or(|expected| expected.len() >= reach));
         for strip in self.strips {
             let end =
                 |at: &[[usize; 2]]| at.iter().map(|at| at[self.parity]).max().unwrap_or(0) + reach;
@@ -202,6 +241,7 @@ unsafe fn cost_kernel<V: Lanes>(
         let most = V::splat(settings.most_difference.saturating_mul(2));
         let occlusion = V::splat(settings.occlusion.saturating_mul(2));
         let unseen = V::splat(settings.unseen.saturating_mul(2));
+        let most_surprise = V::splat(settings.most_surprise);
         for start in Checkerboard::vector_starts(half, V::N) {
             let luminance = V::load(row.luminance.as_ptr().add(start));
             let weak = V::load(row.weak.as_ptr().add(start));
@@ -236,6 +276,17 @@ unsafe fn cost_kernel<V: Lanes>(
                 let mut cost = l.average(r).min(l.min(r).add_saturating(occlusion));
                 cost = cost.replace_where_less(passes, left_blocker.min(right_blocker), unseen);
                 cost = cost.average(V::splat(0));
+                if let Some(expected) = row.expected {
+                    let expected = V::load(expected.as_ptr().add(start));
+                    let here = V::splat(label as u8);
+                    let away = here
+                        .sub_saturating(expected)
+                        .max(expected.sub_saturating(here))
+                        .min(most_surprise);
+                    let away =
+                        away.replace_where_less(V::splat(NOT_EXPECTED - 1), expected, V::splat(0));
+                    cost = cost.add_saturating(away);
+                }
                 cost.store(costs.as_mut_ptr().add(label * stride + start));
             }
         }
