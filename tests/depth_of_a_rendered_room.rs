@@ -284,6 +284,23 @@ fn an_expectation_decides_where_the_images_do_not() {
 }
 
 #[test]
+fn an_expectation_changes_nothing_where_the_images_tell() {
+    let scene = Scene::new(&Room::furnished(), rectified(), CAMERA, [(1.0, 0.0); 2]);
+    let without = scene.estimate(None);
+    // As a mistake that was remembered: everything a little nearer.
+    let nearer: Vec<f32> = scene.middle.depth_m.iter().map(|z| 0.8 * z).collect();
+    let with = scene.estimate(Some(&nearer));
+    let mut told = 0;
+    for pixel in 0..CAMERA.pixels() {
+        if without.confidence[pixel] > 0.0 {
+            told += 1;
+            assert_eq!(with.depth_m[pixel], without.depth_m[pixel]);
+        }
+    }
+    assert!(told * 100 > CAMERA.pixels() * 98, "{told} pixels");
+}
+
+#[test]
 fn what_a_side_cannot_see_is_marked() {
     let scene = Scene::new(&Room::furnished(), rectified(), CAMERA, [(1.0, 0.0); 2]);
     let map = scene.estimate(None);

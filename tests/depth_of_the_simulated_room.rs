@@ -1,4 +1,4 @@
-//! Three cameras see the depth of the simulated room: of all but glass, at least 96 % of the pixels within one label, on
+//! Three cameras see the depth of the simulated room: of all but glass, at least 97 % of the pixels within one label, on
 //! a seed that no setting was chosen on.
 
 use surprised::{
@@ -7,7 +7,7 @@ use surprised::{
 };
 
 #[test]
-fn twenty_four_of_twenty_five_pixels_of_the_simulated_room_are_within_one_label() {
+fn ninety_seven_of_a_hundred_pixels_of_the_simulated_room_are_within_one_label() {
     let frames: Vec<u64> = (40..1300).step_by(160).collect();
     let within = evaluate(
         &Script::tabletop(5),
@@ -16,7 +16,7 @@ fn twenty_four_of_twenty_five_pixels_of_the_simulated_room_are_within_one_label(
     );
     println!("{within:#.2?}");
     assert!(
-        within.within_one_label.is_some_and(|share| share >= 96.0),
+        within.within_one_label.is_some_and(|share| share >= 97.0),
         "{within:?}"
     );
     assert!(

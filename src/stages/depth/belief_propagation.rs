@@ -275,11 +275,11 @@ impl BeliefPropagation {
 
     /// Beliefs of all pixels, row by row. Runs on the threads of the current rayon pool; the result does not depend on
     /// their number.
-    pub fn solve(&mut self) -> &[Belief] {
+    pub fn solve(&mut self) -> &mut [Belief] {
         for at in (0..self.levels.len()).rev() {
             self.propagate(at, at > 0);
         }
-        &self.beliefs
+        &mut self.beliefs
     }
 
     /// Solves all levels but the finest: beliefs of 2x2 pixels each, row by row. Where there is but one level, all is

@@ -15,13 +15,7 @@ pub(super) struct Contrasts {
 
 impl Contrasts {
     /// Contrast are more than `threshold` levels of any colour between neighbours.
-    pub fn find(
-        &mut self,
-        rgb: &[[u8; 3]],
-        width: usize,
-        levels: usize,
-        threshold: u8,
-    ) -> &[Contrast] {
+    pub fn find(&mut self, rgb: &[[u8; 3]], width: usize, levels: usize, threshold: u8) {
         self.levels.resize_with(levels, Contrast::default);
         self.planes.resize_with(levels, Default::default);
         for (channel, plane) in self.planes[0].iter_mut().enumerate() {
@@ -40,7 +34,16 @@ impl Contrasts {
             }
             width = width.div_ceil(2);
         }
+    }
+
+    /// Finest first.
+    pub fn levels(&self) -> &[Contrast] {
         &self.levels
+    }
+
+    /// Red, green and blue of the image that was looked at last.
+    pub fn colours(&self) -> [&[u8]; 3] {
+        self.planes[0].each_ref().map(|plane| &plane[..])
     }
 }
 

@@ -160,14 +160,24 @@ unsafe fn send_kernel<V: Lanes>(sender: &Sender<'_>, sent: [*mut u8; 4]) {
     }
 }
 
+/// Labels so far apart are the same depth, more or less.
+const NEARBY: u8 = 2;
+
 /// What a pixel believes in the end: the costs of its labels with all messages added, around the least.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Belief {
     /// The lowest of the cheapest labels.
     pub label: u8,
     pub cost: u8,
-    /// Least cost among the labels more than one away from `label`; 255 if there is none.
+    /// Least cost among the labels more than [`NEARBY`] away from `label`; 255 if there is none.
     pub rival_cost: u8,
+}
+
+impl Belief {
+    /// By how much any other depth costs more.
+    pub fn margin(&self) -> u8 {
+        self.rival_cost - self.cost
+    }
 }
 
 /// The beliefs of one colour of a row into that row of pixels, `width` long.
@@ -221,7 +231,7 @@ unsafe fn believe_kernel<V: Lanes>(sender: &Sender<'_>, row: &mut [Belief]) {
                 let sum = V::load(sums.add(label * V::N));
                 let label = V::splat(label as u8);
                 let away = label.sub_saturating(best).max(best.sub_saturating(label));
-                rival = rival.replace_where_less(V::splat(1), away, rival.min(sum));
+                rival = rival.replace_where_less(V::splat(NEARBY), away, rival.min(sum));
             }
             best.store(label_of.as_mut_ptr());
             cost.store(cost_of.as_mut_ptr());

@@ -1,8 +1,8 @@
 //! Depth from three cameras, online (the paper's section III-C; the paper computes it offline).
 //! In: the middle image, luminance of the left and right camera, the rig. Out: depth of the middle image, metres.
-//! Open in the paper: see [`plane_sweep`], [`belief_propagation`] and [`refine`], in this order; and who stands in
-//! front of whom. Chosen: a first answer by the coarse levels alone, which is enough to tell which side sees what;
-//! with that the costs are made again, and solved at all levels.
+//! Open in the paper: see [`plane_sweep`], [`belief_propagation`], [`silhouettes`] and [`refine`], in this order; and who
+//! stands in front of whom. Chosen: a first answer by the coarse levels alone, which is enough to tell which side sees
+//! what; with that the costs are made again, and solved at all levels.
 
 pub mod given;
 
@@ -18,6 +18,7 @@ mod rig;
 mod sampling;
 mod side;
 mod sides;
+mod silhouettes;
 mod texture;
 
 pub use belief_propagation::{BeliefPropagation, Contrast, PropagationSettings, Smoothness};
@@ -27,23 +28,32 @@ pub use plane_sweep::SweepSettings;
 pub use rig::{DepthRig, InverseDepthRange, SideCamera};
 pub use sides::SidesDepth;
 
-use crate::{isa::Isa, model::frame::luminance};
+use crate::{
+    isa::{Isa, for_each_isa},
+    model::frame::luminance,
+};
 use contrast::Contrasts;
 use exposure_match::Exposure;
 use plane_sweep::{Middle, Sweep};
 use rayon::prelude::*;
 use refine::Refiner;
 use side::Side;
+use silhouettes::Silhouettes;
 use texture::Textures;
 
 /// Costs are grey levels. The defaults lie in a broad optimum: of 450 random settings around the best of earlier ones,
 /// the values that are best on average over all others, for seeds 1 to 3 of the simulated room and for Middlebury's
-/// tsukuba; those of texture, of contrast and of the iterations are from a later search with the same aims.
+/// tsukuba; those of texture, of contrast, of what is firm or hidden and of the iterations are from later searches with the
+/// same aims.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct DepthSettings {
     pub sweep: SweepSettings,
     /// Mean difference between neighbours, half grey levels, up to which differences between cameras count three times.
     pub weak_texture: u8,
+    /// Likewise, up to which there is nothing but noise to compare, and what is expected has a vote.
+    pub blank_texture: u8,
+    /// Margin, grey levels, from which a belief hides what is behind it from the sides.
+    pub firm: u8,
     /// Between neighbours of like colour; the step is for a shift of one pixel between cameras, however many labels
     /// that is.
     pub smooth: Smoothness,
@@ -62,11 +72,13 @@ impl Default for DepthSettings {
         Self {
             sweep: SweepSettings {
                 most_difference: 16,
-                occlusion: 5,
+                occlusion: 6,
                 most_surprise: 2,
-                unseen: 6,
+                unseen: 7,
             },
-            weak_texture: 15,
+            weak_texture: 20,
+            blank_texture: 5,
+            firm: 28,
             smooth: Smoothness {
                 step: 7,
                 truncation: 24,
@@ -76,7 +88,7 @@ impl Default for DepthSettings {
                 truncation: 7,
             },
             contrast: 7,
-            levels: 5,
+            levels: 4,
             iterations: 3,
             coarse_iterations: 6,
         }
@@ -110,7 +122,7 @@ pub const SEEN_BY_RIGHT: u8 = 2;
 pub struct DepthMap {
     /// Metres along the optical axis; 0 = nothing can be said.
     pub depth_m: Vec<f32>,
-    /// From 0, another depth is as likely, to 1.
+    /// Of what the images say: from 0, another depth is as likely, to 1.
     pub confidence: Vec<f32>,
     /// Which sides see the pixel: [`SEEN_BY_LEFT`], [`SEEN_BY_RIGHT`].
     pub seen_by: Vec<u8>,
@@ -131,6 +143,7 @@ pub struct DepthEstimator {
     middle_y: Vec<u8>,
     contrasts: Contrasts,
     textures: Textures,
+    silhouettes: Silhouettes,
     refiner: Refiner,
     map: DepthMap,
 }
@@ -151,14 +164,16 @@ impl DepthEstimator {
             middle_y: Vec::new(),
             contrasts: Contrasts::default(),
             textures: Textures::default(),
+            silhouettes: Silhouettes::default(),
             refiner: Refiner::default(),
             map: DepthMap::default(),
         }
     }
 
     /// Depth of the middle image, RGB, from the sides' luminances, of the sizes that the rig says; that of a side the rig
-    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) decides where the images leave it open: all
-    /// hypotheses of `range` are tried at every pixel, so that nothing new stays hidden behind an expectation.
+    /// lacks is not looked at. `expected_depth_m` (of the middle image, 0 = none) decides where the images are blank or
+    /// leave it open, and only there: all hypotheses of `range` are tried at every pixel, so that nothing new stays hidden
+    /// behind an expectation, and no mistake that was remembered confirms itself.
     pub fn estimate(
         &mut self,
         rig: &DepthRig,
@@ -179,9 +194,11 @@ impl DepthEstimator {
             expected_depth_m.is_none_or(|depth_m| depth_m.len() == pixels),
             "one expected depth a pixel"
         );
-        self.middle_y.clear();
-        self.middle_y
-            .extend(middle_rgb.iter().map(|rgb| luminance(*rgb)));
+        let (isa, settings) = (self.isa, &self.settings);
+        let contrasts = &mut self.contrasts;
+        contrasts.find(middle_rgb, width, settings.levels, settings.contrast);
+        self.middle_y.resize(pixels, 0);
+        luminances(isa, contrasts.colours(), &mut self.middle_y);
         let middle_y = &*self.middle_y;
         let cameras = [(rig.left, left_y), (rig.right, right_y)];
         let mut exposures = [Exposure::SAME; 2];
@@ -197,7 +214,6 @@ impl DepthEstimator {
                 side.turn(&rig.middle, &camera, range, &exposure.table(), luminance);
             }
         }
-        let (isa, settings) = (self.isa, &self.settings);
         let present = self
             .sides
             .iter()
@@ -220,19 +236,18 @@ impl DepthEstimator {
         let propagation = self.propagation.get_or_insert_with(|| {
             BeliefPropagation::new(kind.3, width, height, range.labels, isa)
         });
-        let contrasts = &mut self.contrasts;
-        propagation.set_contrasts(contrasts.find(
-            middle_rgb,
+        propagation.set_contrasts(contrasts.levels());
+        let textures = &mut self.textures;
+        textures.find(
+            middle_y,
             width,
-            settings.levels,
-            settings.contrast,
-        ));
+            [settings.weak_texture, settings.blank_texture],
+        );
         let middle = Middle {
             intrinsics: &rig.middle,
             luminance: middle_y,
-            weak: self
-                .textures
-                .find_weak(middle_y, width, settings.weak_texture),
+            weak: textures.weak(),
+            blank: textures.blank(),
             expected_depth_m,
         };
         let highest = settings.sweep.highest_cost();
@@ -256,7 +271,7 @@ impl DepthEstimator {
                 if known != first {
                     side.turn(&rig.middle, &camera, range, &known.table(), luminance);
                 }
-                side.block(range, coarse, &rig.middle, 2);
+                side.block(range, coarse, &rig.middle, 2, settings.firm);
             }
         }
         let sides = turned(rig, &self.sides);
@@ -267,6 +282,9 @@ impl DepthEstimator {
             |scratch, y, row| sweep.fill_row(scratch, y, row),
         );
         let beliefs = propagation.solve();
+        self.silhouettes
+            .follow(isa, contrasts.colours(), width, beliefs);
+        let beliefs = &*beliefs;
 
         let map = &mut self.map;
         map.label_step = range.step() as f32;
@@ -278,31 +296,39 @@ impl DepthEstimator {
         let bits = [(rig.left, SEEN_BY_LEFT), (rig.right, SEEN_BY_RIGHT)];
         for (side, (camera, bit)) in self.sides.iter_mut().zip(bits) {
             if camera.is_some() {
-                side.block(range, beliefs, &rig.middle, 1);
+                side.block(range, beliefs, &rig.middle, 1, settings.firm);
                 side.mark_seen(range, beliefs, width, bit, &mut map.seen_by);
             }
         }
         map.depth_m.resize(pixels, 0.0);
         map.confidence.resize(pixels, 0.0);
         let certain = f32::from(settings.sweep.most_difference);
+        let expected_depth_m = expected_depth_m.unwrap_or(&[]);
         let outputs = map
             .depth_m
             .par_iter_mut()
             .zip(&mut map.confidence)
             .zip(&mut map.inverse_depth)
             .with_min_len(4096);
-        outputs.zip(beliefs).zip(&map.seen_by).for_each(
-            |((((depth_m, confidence), label), belief), seen_by)| {
-                let inverse_depth = range.far as f32 + *label * range.step() as f32;
-                *label = inverse_depth;
-                let margin = f32::from(belief.rival_cost - belief.cost);
+        outputs.zip(beliefs).zip(&map.seen_by).enumerate().for_each(
+            |(pixel, ((((depth_m, confidence), label), belief), seen_by))| {
+                let mut inverse_depth = range.far as f32 + *label * range.step() as f32;
+                let margin = f32::from(belief.margin());
                 *confidence = if *seen_by == 0 {
                     0.0
                 } else {
                     (margin / certain).min(1.0)
                 };
+                let mut is_known = *confidence > 0.0;
+                if !is_known
+                    && let Some(expected_m) = expected_depth_m.get(pixel).filter(|z| **z > 0.0)
+                {
+                    inverse_depth = 1.0 / expected_m;
+                    is_known = true;
+                }
+                *label = inverse_depth;
                 // Infinitely far is no depth either.
-                *depth_m = if *confidence > 0.0 && inverse_depth > 0.0 {
+                *depth_m = if is_known && inverse_depth > 0.0 {
                     1.0 / inverse_depth
                 } else {
                     0.0
@@ -310,6 +336,20 @@ impl DepthEstimator {
             },
         );
         &self.map
+    }
+}
+
+for_each_isa! {
+    fn luminances(colours: [&[u8]; 3], luminances: &mut [u8]) = luminances_kernel;
+}
+
+/// Of each pixel from its red, green and blue.
+#[inline(always)]
+fn luminances_kernel([red, green, blue]: [&[u8]; 3], luminances: &mut [u8]) {
+    let n = luminances.len();
+    let (red, green, blue) = (&red[..n], &green[..n], &blue[..n]);
+    for x in 0..n {
+        luminances[x] = luminance([red[x], green[x], blue[x]]);
     }
 }
 

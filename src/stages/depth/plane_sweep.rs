@@ -43,6 +43,8 @@ pub(super) struct Middle<'a> {
     pub luminance: &'a [u8],
     /// 255 where a difference counts three times, else 0.
     pub weak: &'a [u8],
+    /// 255 where it has a vote what is expected, else 0.
+    pub blank: &'a [u8],
     /// Metres, 0 = none.
     pub expected_depth_m: Option<&'a [f32]>,
 }
@@ -142,9 +144,12 @@ impl<'a> Sweep<'a> {
                 *to = *from;
             }
             if let Some(depth_m) = middle.expected_depth_m {
-                let here = depth_m[pixels.clone()].iter().skip(parity).step_by(2);
-                for (to, depth_m) in expected.iter_mut().zip(here) {
-                    *to = if *depth_m > 0.0 {
+                let here = depth_m[pixels.clone()]
+                    .iter()
+                    .zip(&middle.blank[pixels.clone()]);
+                let here = here.skip(parity).step_by(2);
+                for (to, (depth_m, blank)) in expected.iter_mut().zip(here) {
+                    *to = if *depth_m > 0.0 && *blank != 0 {
                         range
                             .label_of_depth(f64::from(*depth_m))
                             .round()

@@ -15,16 +15,28 @@ pub(super) struct Textures {
     /// Sums down columns, over the rows around one; `REACH` zeros at both ends.
     columns: Vec<u16>,
     weak: Vec<u8>,
+    blank: Vec<u8>,
 }
 
 impl Textures {
-    /// 255 where neighbours differ by no more than `most` half grey levels on average, else 0.
-    pub fn find_weak(&mut self, luminance: &[u8], width: usize, most: u8) -> &[u8] {
+    /// 255 where neighbours differ little, else 0.
+    pub fn weak(&self) -> &[u8] {
+        &self.weak
+    }
+
+    /// 255 where they hardly differ at all, else 0.
+    pub fn blank(&self) -> &[u8] {
+        &self.blank
+    }
+
+    /// Where neighbours differ on average by no more than so many half grey levels: [`Self::weak`] and [`Self::blank`].
+    pub fn find(&mut self, luminance: &[u8], width: usize, most: [u8; 2]) {
         let height = luminance.len() / width;
         let Self {
             differences,
             columns,
             weak,
+            blank,
         } = self;
         differences.clear();
         differences.resize(luminance.len(), 0);
@@ -40,6 +52,7 @@ impl Textures {
             }
         }
         weak.resize(luminance.len(), 0);
+        blank.resize(luminance.len(), 0);
         columns.clear();
         columns.resize(width + 2 * REACH, 0);
         let row = |y: usize| &differences[y * width..(y + 1) * width];
@@ -48,7 +61,10 @@ impl Textures {
                 *sum += u16::from(*difference);
             }
         }
-        for (y, weak) in weak.chunks_exact_mut(width).enumerate() {
+        let rows = weak
+            .chunks_exact_mut(width)
+            .zip(blank.chunks_exact_mut(width));
+        for (y, (weak, blank)) in rows.enumerate() {
             if y + REACH < height {
                 for (sum, difference) in columns[REACH..].iter_mut().zip(row(y + REACH)) {
                     *sum += u16::from(*difference);
@@ -60,7 +76,7 @@ impl Textures {
                 }
             }
             let rows = (y + REACH + 1).min(height) - y.saturating_sub(REACH);
-            let is_weak = |sum: u16, pixels: usize| {
+            let at_most = |most: u8, sum: u16, pixels: usize| {
                 if 2 * usize::from(sum) <= usize::from(most) * pixels {
                     255
                 } else {
@@ -68,17 +84,18 @@ impl Textures {
                 }
             };
             let whole = rows * (2 * REACH + 1);
-            for (x, to) in weak.iter_mut().enumerate() {
+            for x in 0..width {
                 let sum = columns[x..x + 2 * REACH + 1].iter().sum();
-                *to = is_weak(sum, whole);
+                weak[x] = at_most(most[0], sum, whole);
+                blank[x] = at_most(most[1], sum, whole);
             }
             // At both ends there are fewer columns.
             for x in (0..width.min(REACH)).chain(width.saturating_sub(REACH)..width) {
                 let columns_there = (x + REACH + 1).min(width) - x.saturating_sub(REACH);
                 let sum = columns[x..x + 2 * REACH + 1].iter().sum();
-                weak[x] = is_weak(sum, rows * columns_there);
+                weak[x] = at_most(most[0], sum, rows * columns_there);
+                blank[x] = at_most(most[1], sum, rows * columns_there);
             }
         }
-        weak
     }
 }
