@@ -150,10 +150,10 @@ struct Forget {
     #[arg(long = "box", value_name = "X,Y,Z,X,Y,Z", allow_hyphen_values = true)]
     bounds: Option<Numbers<6>>,
     /// What was written last from then on, seconds since 1970.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = finite)]
     since: Option<f64>,
     /// What was written last before, seconds since 1970.
-    #[arg(long, value_name = "SECONDS")]
+    #[arg(long, value_name = "SECONDS", value_parser = finite)]
     until: Option<f64>,
     /// The whole place.
     #[arg(long)]
@@ -178,6 +178,14 @@ impl<const N: usize> FromStr for Numbers<N> {
             .map(Self)
             .ok_or_else(|| format!("these must be {N} numbers with commas between them"))
     }
+}
+
+/// NaN would be a time of its own.
+fn finite(text: &str) -> Result<f64, String> {
+    let number = text.trim().parse().ok();
+    number
+        .filter(|number: &f64| number.is_finite())
+        .ok_or_else(|| "this must be a finite number".to_owned())
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]

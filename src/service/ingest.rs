@@ -151,8 +151,15 @@ impl Door {
     }
 
     fn bad_key(&self, key: &str) {
-        self.counters.bad_keys.fetch_add(1, Ordering::Relaxed);
-        tracing::debug!("{key} names no camera: places, robots and cameras are [a-z0-9_-]+");
+        let count = 1 + self.counters.bad_keys.fetch_add(1, Ordering::Relaxed);
+        // Nobody can be told on such a key; a robot that goes on would fill the log.
+        if count.is_power_of_two() {
+            tracing::warn!(
+                count,
+                "{key} names no camera: places, robots and cameras are [a-z0-9_-]+, at most {} long",
+                keys::ID_LENGTH_MAX
+            );
+        }
     }
 }
 

@@ -200,6 +200,7 @@ async fn mode_of(
     camera: &CameraPath,
     query: &Query,
 ) -> Result<Held<Payload>, Refusal> {
+    known(keys::MODE, query.parameters())?;
     let mode = questions.mode(camera, mode_to_set(query)?).await?;
     payload(&encode::mode(mode), query.parameters(), None)
 }
@@ -225,6 +226,7 @@ async fn reply_to(
     questions: &Questions,
 ) -> Result<Held<Payload>, Refusal> {
     let parameters = query.parameters();
+    known(question, parameters)?;
     match question {
         "prior" => {
             let (request, _room) = request(query, questions)?;
@@ -273,6 +275,33 @@ async fn reply_to(
                 room: None,
             })
         }
+    }
+}
+
+/// Refuses what no question of this kind has: a misspelt region must not become a larger one.
+fn known(question: &str, parameters: &Parameters<'_>) -> Result<(), Refusal> {
+    let own: &[&str] = match question {
+        "prior" => &[
+            "x", "y", "z", "qx", "qy", "qz", "qw", "fx", "fy", "cx", "cy", "width", "height",
+            "planes",
+        ],
+        "evaluate" => &["robot", "camera"],
+        "views" => &["after", "limit"],
+        "next_view" => &["robot", "camera", "radius", "count"],
+        FORGET => &["sphere", "box", "since", "until", "everything"],
+        keys::MODE => &["set"],
+        _ => &[],
+    };
+    // Zenoh's own begin with an underscore.
+    let unknown = parameters.iter().find(|(name, _)| {
+        !name.is_empty() && !name.starts_with('_') && *name != "format" && !own.contains(name)
+    });
+    match unknown {
+        None => Ok(()),
+        Some((name, _)) => Err(bad(format!(
+            "{question} has no parameter {name}: it has {}",
+            [own, &["format"]].concat().join(", ")
+        ))),
     }
 }
 
@@ -460,7 +489,12 @@ fn forget_parameters(
             "since" => &mut span.since,
             _ => &mut span.until,
         };
-        // Saturates; NaN is 1970.
+        if !seconds.is_finite() {
+            return Err(bad(format!(
+                "the parameter {name} must be finite: seconds since 1970"
+            )));
+        }
+        // Saturates.
         *end = Some(encode::timestamp((seconds * 1e9).round() as i64));
     }
     match parameters.get("everything") {

@@ -34,7 +34,7 @@ pub struct ZenohOptions {
 const ZENOH_MESSAGE_BYTES_MAX: &str = "1073741824";
 
 impl ZenohOptions {
-    /// `message_bytes_max`: longer messages are dropped unless the configuration says otherwise.
+    /// `message_bytes_max`: messages twice as long are dropped unseen unless the configuration says otherwise.
     ///
     /// # Errors
     /// Files and values that Zenoh refuses.
@@ -77,7 +77,8 @@ impl ZenohOptions {
             (
                 "transport/link/rx/max_message_size",
                 ZENOH_MESSAGE_BYTES_MAX,
-                message_bytes_max.to_string(),
+                // What is longer than may be taken is refused with a reason, unless it is twice as long.
+                message_bytes_max.saturating_mul(2).to_string(),
             ),
         ];
         for (key, unset, value) in defaults {

@@ -17,7 +17,7 @@ use zenoh::{bytes::Encoding, key_expr::KeyExpr};
 use crate::model::frame::Source;
 
 /// Longer names help nobody and every one of them is kept.
-const ID_LENGTH_MAX: usize = 64;
+pub const ID_LENGTH_MAX: usize = 64;
 
 pub const FRAME: &str = "frame";
 pub const CALIBRATION: &str = "calibration";

@@ -95,6 +95,10 @@ async fn nothing_is_forgotten_by_accident() {
         ("sphere=0,0,2,1;box=0,0,0,1,1,1", "either `sphere` or `box`"),
         ("box=0,0,3,1,1,2", "not below its max"),
         ("since=soon", "no number"),
+        ("since=nan", "must be finite"),
+        // Without the sphere this would be everything.
+        ("sphre=0,0,2,0.1;since=0", "no parameter sphre"),
+        ("everything=true;robot=anna", "no parameter robot"),
     ] {
         let refused = forget(&rig, parameters).await.expect_err(parameters);
         assert!(refused.contains(sentence), "{parameters}: {refused}");
@@ -125,6 +129,20 @@ async fn nothing_is_forgotten_by_accident() {
         (page.status, page.json()["code"].as_str()),
         (400, Some("undecodable"))
     );
+    // A browser sends these for the pages of other sites.
+    for from_elsewhere in [
+        &["Sec-Fetch-Site: cross-site", "Content-Type: text/plain"][..],
+        &["Origin: http://evil.example"],
+        &["Origin: null"],
+    ] {
+        let path = "POST /api/v1/places/lab/forget";
+        let page = send(&rig, path, from_elsewhere, b"{\"everything\":true}").await;
+        assert_eq!(
+            (page.status, page.json()["code"].as_str()),
+            (403, Some("origin")),
+            "{from_elsewhere:?}"
+        );
+    }
     assert_eq!(rig.ask(&keys::memory(ROOT, "lab", "views")).await, before);
     rig.stop().await.expect("a clean stop");
 }

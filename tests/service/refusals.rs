@@ -1,5 +1,6 @@
 //! A frame that cannot be used is refused with a code and a sentence, is counted, and changes nothing.
 
+use image::{ExtendedColorType, codecs::jpeg::JpegEncoder};
 use surprised::{
     model::pose::Pose,
     wire::{encode, keys, proto},
@@ -10,7 +11,7 @@ use crate::rig::{Rig, camera, next_rejection, next_report, posed};
 type Spoil = fn(&mut proto::Frame);
 
 /// What is done to a good frame, and the code it is refused with.
-const SPOILED: [(&str, Spoil); 22] = [
+const SPOILED: [(&str, Spoil); 23] = [
     ("no_stamp", |frame| frame.stamp = None),
     ("bad_stamp", |frame| {
         frame.stamp.as_mut().expect("set").nanos = -1;
@@ -43,6 +44,14 @@ const SPOILED: [(&str, Spoil); 22] = [
     ("image_data", |frame| {
         image(frame).encoding = "jpeg".to_owned()
     }),
+    ("image_data", |frame| {
+        let image = image(frame);
+        let (width, height) = (image.width, image.height);
+        image.data = jpeg(&image.data, width, height);
+        // Enough of it for a decoder that does not mind.
+        image.data.truncate(image.data.len() * 9 / 10);
+        image.encoding = "jpeg".to_owned();
+    }),
     ("depth_encoding", |frame| {
         depth(frame).encoding = "rgb8".to_owned()
     }),
@@ -64,6 +73,14 @@ fn pose(frame: &mut proto::Frame) -> &mut proto::Pose {
 
 fn image(frame: &mut proto::Frame) -> &mut proto::Image {
     frame.image.as_mut().expect("set")
+}
+
+fn jpeg(rgb: &[u8], width: u32, height: u32) -> Vec<u8> {
+    let mut file = Vec::new();
+    JpegEncoder::new(&mut file)
+        .encode(rgb, width, height, ExtendedColorType::Rgb8)
+        .expect("it has its size");
+    file
 }
 
 fn depth(frame: &mut proto::Frame) -> &mut proto::Image {

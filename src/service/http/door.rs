@@ -5,7 +5,7 @@ use std::{fmt::Write, net::IpAddr, sync::Arc};
 
 use axum::{
     extract::{Request, State},
-    http::{HeaderMap, HeaderValue, StatusCode, header},
+    http::{HeaderMap, HeaderValue, Method, StatusCode, header},
     middleware::Next,
     response::{IntoResponse, Response},
 };
@@ -74,6 +74,32 @@ impl Door {
             .any(|(name, value)| name == COOKIE && self.session.is(value))
     }
 
+    /// Without a token nothing but the browser stands between other sites' pages and what changes something here: it sends
+    /// such requests for them, and says where they are from. With one there is a cookie that it does not send for others.
+    fn is_for_another_site(&self, method: &Method, headers: &HeaderMap) -> bool {
+        if self.access.token.is_some() || method.is_safe() {
+            return false;
+        }
+        if let Some(site) = headers.get("sec-fetch-site") {
+            return site != "same-origin" && site != "none";
+        }
+        // Programs send no origin.
+        let Some(origin) = headers.get(header::ORIGIN) else {
+            return false;
+        };
+        let origin = origin
+            .to_str()
+            .ok()
+            .and_then(|origin| origin.split_once("://"));
+        let host = headers
+            .get(header::HOST)
+            .and_then(|host| host.to_str().ok());
+        match (origin, host) {
+            (Some((_, from)), Some(host)) => !from.eq_ignore_ascii_case(host),
+            _ => true,
+        }
+    }
+
     /// Without a token whoever is on this machine may come in, but not pages of other sites whose name was made to lead
     /// here (DNS rebinding).
     fn knows_host(&self, headers: &HeaderMap) -> bool {
@@ -101,7 +127,14 @@ fn is_here(host: &str) -> bool {
 
 /// For every request.
 pub async fn guard(State(door): State<Arc<Door>>, request: Request, next: Next) -> Response {
-    let mut response = if door.knows_host(request.headers()) {
+    let mut response = if door.is_for_another_site(request.method(), request.headers()) {
+        Problem::new(
+            StatusCode::FORBIDDEN,
+            "origin",
+            "a page of another site asked for this: only this service's own page may change something from a browser",
+        )
+        .into_response()
+    } else if door.knows_host(request.headers()) {
         next.run(request).await
     } else {
         Problem::new(

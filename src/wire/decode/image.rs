@@ -193,7 +193,19 @@ fn compressed(image: &Image, format: ImageFormat, limits: Limits) -> Result<Dyna
             ),
         ));
     }
+    if format == ImageFormat::Jpeg && !ends(&image.data) {
+        return Err(Refusal::new(
+            "image_data",
+            "the jpeg has no end (FF D9): was it cut short on its way?",
+        ));
+    }
     DynamicImage::from_decoder(decoder).map_err(broken)
+}
+
+/// Whether a jpeg is there to its end: the decoder makes grey of what is not. Some cameras pad with zeros.
+fn ends(jpeg: &[u8]) -> bool {
+    let padding = jpeg.iter().rev().take_while(|byte| **byte == 0).count();
+    jpeg[..jpeg.len() - padding].ends_with(&[0xff, 0xd9])
 }
 
 /// Sides that can be used and not too many pixels.
