@@ -1,7 +1,11 @@
 //! Cameras are switched between learning, observing and freezing while frames come, over Zenoh and HTTP.
 
 use serde_json::json;
-use surprised::wire::{decode, encode, keys, proto};
+use surprised::{
+    memory::store::Store,
+    wire::{decode, encode, keys, proto},
+};
+use tempfile::TempDir;
 
 use crate::{
     rig::{ROOT, Rig, Samples, camera, changed, next_rejection, next_report, wall},
@@ -26,7 +30,10 @@ struct Shown {
 
 impl Shown {
     async fn start(settings: &[&str]) -> Self {
-        let rig = Rig::start(settings).await;
+        Self::to(Rig::start(settings).await).await
+    }
+
+    async fn to(rig: Rig) -> Self {
         let head = camera("lab", "anna");
         let reports = rig.subscribe(&head, keys::REPORT).await;
         rig.put_calibration(&head).await;
@@ -164,4 +171,53 @@ async fn pages_switch_cameras_and_whole_places() {
     assert_eq!(rig.status("lab").await["mode"], "learn");
     assert_eq!(shown.show(false).await, (true, false));
     shown.rig.stop().await.expect("a clean stop");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_service_that_does_not_write_the_place_sets_no_mode_until_it_does() {
+    let folder = TempDir::new().expect("a folder");
+    let store = || Store::in_folder(folder.path().to_owned()).expect("a store");
+    let mut first = Shown::to(Rig::remembering(&[], Some(store())).await).await;
+    assert_eq!(first.show(false).await, (true, false));
+    let stored = |status: &serde_json::Value| status["store"]["written"] == 1;
+    first.rig.status_when("lab", stored).await;
+
+    let second = Rig::remembering(&[], Some(store())).await;
+    let (one, all) = (
+        first.head.key(ROOT, keys::MODE),
+        keys::memory(ROOT, "lab", "mode"),
+    );
+    for key in [&one, &all] {
+        let refused = second.try_ask(&format!("{key}?set=freeze"), None).await;
+        let refused = refused.expect_err("the first one writes the place");
+        assert!(refused.starts_with("place_held: "), "{refused}");
+    }
+    let rejections = second.subscribe(&first.head, keys::REJECTED).await;
+    second.session.put(&one, "freeze").await.expect("put");
+    let rejection = next_rejection(&rejections).await;
+    assert_eq!(
+        (rejection.code.as_str(), &rejection.key),
+        ("place_held", &one)
+    );
+    for path in ["mode", "robots/anna/head/mode"] {
+        let path = format!("PUT /api/v1/places/lab/{path}");
+        let refused = send_json(&second, &path, json!({"mode": "freeze"})).await;
+        assert_eq!(
+            (refused.status, &refused.json()["code"]),
+            (400, &json!("place_held"))
+        );
+    }
+    // Nothing of it holds here, nor at the one that learns.
+    for key in [&one, &all] {
+        let mode = second.ask(&format!("{key}?format=json")).await;
+        assert_eq!(mode, br#"{"mode":"learn"}"#);
+    }
+    assert_eq!(first.show(false).await, (true, false));
+
+    first.rig.stop().await.expect("a clean stop");
+    let writes = |status: &serde_json::Value| status["store"]["role"] == "writer";
+    second.status_when("lab", writes).await;
+    second.ask(&format!("{all}?set=freeze")).await;
+    assert_eq!(second.status("lab").await["mode"], "freeze");
+    second.stop().await.expect("a clean stop");
 }

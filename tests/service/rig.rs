@@ -5,6 +5,7 @@ use std::{future::Future, net::SocketAddr, time::Duration};
 use surprised::{
     config::{Preset, Settings},
     engine::EngineKind,
+    memory::store::Store,
     model::{
         camera::{Calibration, Intrinsics},
         frame::{DepthSource, Frame, RgbImage, Source},
@@ -48,10 +49,15 @@ pub struct Rig {
 
 impl Rig {
     pub async fn start(settings: &[&str]) -> Self {
+        Self::remembering(settings, None).await
+    }
+
+    /// Where its memory lasts.
+    pub async fn remembering(settings: &[&str], store: Option<Store>) -> Self {
         let settings: Vec<String> = settings.iter().map(|&pair| pair.to_owned()).collect();
         let alone = ["scouting/gossip/enabled:false".to_owned()];
         let service = Service::start(Options {
-            store: None,
+            store,
             engine: EngineKind::Cpu,
             settings: Settings::layered(Preset::Robust, None, &settings).expect("good settings"),
             root: "test/surprised".to_owned(),

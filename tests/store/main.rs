@@ -11,6 +11,8 @@ mod flaky;
 
 mod suite;
 
+mod leases;
+
 mod outages;
 
 mod residency;

@@ -9,7 +9,10 @@
 //! Whatever is still on its way from the old holder is of epoch N and harms nothing of epoch N+1 (see `shelf`).
 //!
 //! A clean stop says so in the lease, and the next one need not wait. On disk the holder also keeps a file locked, which
-//! the system unlocks when the process is gone, however it went: whoever can lock that file need not wait either.
+//! the system unlocks when the process is gone, however it went: whoever can lock that file need not wait either, if the
+//! lease says that its holder had locked it. A file that is locked is that of the holder, or of one that is about to make
+//! a lease: the place is left to it unless it hangs, that is, nothing has changed for [`EXPIRES_AFTER`]. Who takes over
+//! from such a one holds no lock, says so, and locks the file as soon as it can.
 
 use std::{
     fs::{File, TryLockError},
@@ -34,6 +37,9 @@ struct Content {
     beat: u64,
     /// The holder has stopped.
     released: bool,
+    /// The holder has locked the file: where that is not locked any more, it is gone.
+    #[serde(default)]
+    locked: bool,
 }
 
 /// A place that is ours to write.
@@ -44,7 +50,7 @@ pub struct Lease {
     /// When the last renewal that succeeded began.
     renewed: Instant,
     /// Kept locked.
-    _lock: Option<File>,
+    lock: Option<File>,
 }
 
 /// How a look at the latest lease ended.
@@ -58,8 +64,8 @@ pub enum Looked {
 /// Watches a lease that somebody else holds.
 #[derive(Debug, Default)]
 pub struct Watcher {
-    /// The latest lease, and since when it has not changed.
-    seen: Option<(u64, Bytes, Instant)>,
+    /// The latest lease, if there is one, and since when that has not changed.
+    seen: Option<(Option<(u64, Bytes)>, Instant)>,
 }
 
 /// Which process on which machine this is, for people.
@@ -74,41 +80,50 @@ pub fn own_name() -> String {
 impl Watcher {
     /// Takes the place if nobody holds it. `epoch_min` is greater than every epoch that is known otherwise.
     pub async fn look(&mut self, shelf: &Shelf, name: &str, epoch_min: u64) -> Result<Looked> {
-        let latest = shelf.latest_lease().await?;
+        // First, so that whoever has locked the file sees what the one before it has left.
         let lock = shelf.lock_file().and_then(lock);
-        let locked = matches!(lock, Some(LockState::Ours(_)));
-        let epoch = match &latest {
-            None => epoch_min,
-            Some((epoch, bytes)) => {
-                let unchanged = match &self.seen {
-                    Some((seen, content, since)) if (seen, content) == (epoch, bytes) => {
-                        since.elapsed()
-                    }
-                    _ => {
-                        self.seen = Some((*epoch, bytes.clone(), Instant::now()));
-                        Duration::ZERO
-                    }
-                };
-                // What cannot be read says nothing, but it can still be seen to change.
-                let content: Option<Content> = serde_json::from_slice(bytes).ok();
-                let released = content.as_ref().is_some_and(|content| content.released);
-                if !released && !locked && unchanged < EXPIRES_AFTER {
-                    let holder = content.map(|content| content.holder);
-                    return Ok(Looked::Held(
-                        holder.unwrap_or_else(|| "another service".to_owned()),
-                    ));
-                }
-                epoch_min.max(epoch + 1)
-            }
+        let latest = shelf.latest_lease().await?;
+        let since = match &self.seen {
+            Some((seen, since)) if *seen == latest => *since,
+            _ => Instant::now(),
         };
-        if let Some(LockState::Others) = lock {
-            // It stopped renewing but still runs: epochs keep the two apart.
-            tracing::warn!("the process that wrote this place hangs: taking over");
+        // What cannot be read says nothing, but it can still be seen to change.
+        let content: Option<Content> = latest
+            .as_ref()
+            .and_then(|(_, bytes)| serde_json::from_slice(bytes).ok());
+        let unheld = latest.is_none() || content.as_ref().is_some_and(|content| content.released);
+        let free = match lock {
+            Some(LockState::Ours(_)) => {
+                unheld || content.as_ref().is_some_and(|content| content.locked)
+            }
+            Some(LockState::Others) => false,
+            None => unheld,
+        };
+        let epoch = latest
+            .as_ref()
+            .map_or(epoch_min, |(epoch, _)| epoch_min.max(epoch + 1));
+        self.seen = Some((latest, since));
+        if !free && since.elapsed() < EXPIRES_AFTER {
+            let holder = content.filter(|content| !content.released);
+            return Ok(Looked::Held(holder.map_or_else(
+                || "another service".to_owned(),
+                |content| content.holder,
+            )));
         }
+        let lock = match lock {
+            Some(LockState::Ours(file)) => Some(file),
+            Some(LockState::Others) => {
+                // It stopped renewing but still runs: epochs keep the two apart.
+                tracing::warn!("the process that wrote this place hangs: taking over");
+                None
+            }
+            None => None,
+        };
         let content = Content {
             holder: name.to_owned(),
             beat: 0,
             released: false,
+            locked: lock.is_some(),
         };
         let began = Instant::now();
         if !shelf.create_lease(epoch, content.bytes()).await? {
@@ -119,10 +134,7 @@ impl Watcher {
             epoch,
             content,
             renewed: began,
-            _lock: match lock {
-                Some(LockState::Ours(file)) => Some(file),
-                _ => None,
-            },
+            lock,
         }))
     }
 }
@@ -136,7 +148,13 @@ impl Lease {
     /// False: somebody has taken the place.
     pub async fn renew(&mut self, shelf: &Shelf) -> Result<bool> {
         let began = Instant::now();
+        if self.lock.is_none()
+            && let Some(LockState::Ours(file)) = shelf.lock_file().and_then(lock)
+        {
+            self.lock = Some(file);
+        }
         self.content.beat += 1;
+        self.content.locked = self.lock.is_some();
         shelf.renew_lease(self.epoch, self.content.bytes()).await?;
         let epochs = shelf.lease_epochs().await?;
         if epochs.iter().any(|&epoch| epoch > self.epoch) {

@@ -86,13 +86,20 @@ impl PlaceStore {
         let state = self.shared.lock();
         match &state.role {
             Role::Writer => Ok(()),
-            Role::Reader { holder } => Err(Refusal::new(
-                "place_held",
-                format!(
-                    "this place is written by another service ({holder}); this one answers questions and takes over when that one is gone"
-                ),
-            )),
+            Role::Reader { holder } => Err(held(holder)),
             Role::Unread => Err(unread(&state)),
+        }
+    }
+
+    /// Whether what is said here about modes will hold. Before the place has been read that is kept until it can be
+    /// stored.
+    ///
+    /// # Errors
+    /// `place_held`.
+    pub fn may_say(&self) -> Result<(), Refusal> {
+        match &self.shared.lock().role {
+            Role::Reader { holder } => Err(held(holder)),
+            Role::Writer | Role::Unread => Ok(()),
         }
     }
 
@@ -421,6 +428,15 @@ impl PlaceStore {
         }
         closed && left == 0
     }
+}
+
+fn held(holder: &str) -> Refusal {
+    Refusal::new(
+        "place_held",
+        format!(
+            "this place is written by another service ({holder}); this one answers questions and takes over when that one is gone"
+        ),
+    )
 }
 
 fn unread(state: &State) -> Refusal {

@@ -39,7 +39,13 @@ impl Desk {
     }
 
     /// Of a camera, or of all of them: what was said for single ones before is forgotten then.
+    ///
+    /// # Errors
+    /// Another service writes the place and would go on as before; too many cameras.
     pub(super) fn set_mode(&mut self, source: Option<&Source>, mode: Mode) -> Result<(), Refusal> {
+        if let Some(memory) = &self.worker.memory {
+            memory.may_say()?;
+        }
         let said = Modes::said(source, mode);
         let then = self.modes.then(&said);
         if then.cameras.len() > MODES_MAX {
