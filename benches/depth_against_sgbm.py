@@ -4,13 +4,14 @@
     target/venv/bin/python benches/depth_against_sgbm.py ../shared/data/tsukuba
 
 Prints the time of the processor for one thread and of the clock for two, best and median of the repetitions in turns.
-A Xeon with AVX-512, two cores, with real-time priority (`chrt -f 10`); best of 40, milliseconds, and their share of SGBM's; 64 labels.
+A Xeon with AVX-512, two cores, with real-time priority (`chrt -f 10`) beside a run of the tests; best of 24, milliseconds,
+and their share of SGBM's; 64 labels.
 
     size     threads  SGBM-HH, 2 cameras  ours, 3 cameras  ours, 2 cameras
-    320x240  1         14.0               15.4 (1.10)      14.1 (1.01)
-    320x240  2         14.0               10.2 (0.73)       9.1 (0.65)
-    640x480  1         79.2               53.2 (0.67)      49.8 (0.63)
-    640x480  2         78.5               33.0 (0.42)      28.5 (0.36)
+    320x240  1         19.5               21.1 (1.08)      19.3 (0.99)
+    320x240  2                            17.4 (0.62)      15.2 (0.55)
+    640x480  1        163.9               93.6 (0.57)      89.2 (0.54)
+    640x480  2        166.4               60.6 (0.36)      55.2 (0.33)
 """
 
 import pathlib
