@@ -414,6 +414,8 @@ pub enum ConfigError {
         "there is no setting called `{0}`; `surprised serve --help` says where they are listed"
     )]
     Unknown(String),
+    #[error("settings: no robot can be called `{0}`: names are made of a-z, 0-9, _ and -")]
+    Robot(String),
     #[error("setting `{name}` is {value}, but must be between {low} and {high}")]
     Bound {
         name: &'static str,

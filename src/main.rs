@@ -49,8 +49,11 @@ async fn run() -> ExitCode {
     match arguments.run().await {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("surprised: {error:#}");
-            ExitCode::from(exit_code(&error))
+            let code = exit_code(&error);
+            if code != 0 {
+                eprintln!("surprised: {error:#}");
+            }
+            ExitCode::from(code)
         }
     }
 }

@@ -2,13 +2,8 @@
 
 use std::path::PathBuf;
 
-use anyhow::ensure;
-
-use super::options::stored_memory;
-use crate::{
-    memory::store::{Store, archive::Archived},
-    wire::keys,
-};
+use super::{options::stored_memory, output, replay::id};
+use crate::memory::store::{Store, archive::Archived};
 
 /// Write what is remembered of a place to a file
 #[derive(Debug, clap::Args)]
@@ -26,7 +21,7 @@ pub struct Import {
 
 #[derive(Debug, clap::Args)]
 struct PlaceAndFile {
-    #[arg(value_name = "PLACE")]
+    #[arg(value_name = "PLACE", value_parser = id)]
     place: String,
     #[arg(value_name = "FILE")]
     file: PathBuf,
@@ -37,25 +32,20 @@ struct PlaceAndFile {
 
 impl PlaceAndFile {
     fn store(&self) -> anyhow::Result<Store> {
-        ensure!(
-            keys::is_id(&self.place),
-            "a place is called [a-z0-9_-]+, not {}",
-            self.place
-        );
         let store = stored_memory(self.memory.as_deref())?;
         store
             .ok_or_else(|| anyhow::anyhow!("nothing lasts in memory://: name a folder or a bucket"))
     }
 
-    fn print(&self, done: &str, archived: Archived) {
-        println!(
+    fn print(&self, done: &str, archived: Archived) -> anyhow::Result<()> {
+        output::line(format_args!(
             "{}: {} viewpoints and {} events, {:.1} MB {done} {}",
             self.place,
             archived.viewpoints,
             archived.events,
             archived.bytes as f64 / 1e6,
             self.file.display()
-        );
+        ))
     }
 }
 
@@ -68,8 +58,7 @@ impl Export {
             .store()?
             .export(&self.of.place, &self.of.file)
             .await?;
-        self.of.print("written to", archived);
-        Ok(())
+        self.of.print("written to", archived)
     }
 }
 
@@ -82,7 +71,6 @@ impl Import {
             .store()?
             .import(&self.of.place, &self.of.file)
             .await?;
-        self.of.print("stored from", archived);
-        Ok(())
+        self.of.print("stored from", archived)
     }
 }

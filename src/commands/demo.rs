@@ -6,6 +6,7 @@ use tokio::sync::watch;
 use super::{
     fleet::{self, Network, PaceOptions, Sensors, WorldOptions},
     options::ServiceOptions,
+    output,
     serve::stop_signal,
 };
 use crate::service::{Service, session::ZenohOptions};
@@ -52,17 +53,19 @@ impl Demo {
             .context("the service listens nowhere: give it --listen tcp/127.0.0.1:0")?
             .clone();
         match service.http_addr() {
-            Some(addr) => println!("The page is at http://{addr}/ - Ctrl-C ends it"),
-            None => println!("no HTTP - Ctrl-C ends it"),
+            Some(addr) => output::line(format_args!(
+                "The page is at http://{addr}/ - Ctrl-C ends it"
+            ))?,
+            None => output::line("no HTTP - Ctrl-C ends it")?,
         }
         let eyes = match sensors {
             Sensors::Depth => "a depth camera",
             Sensors::Rig => "three cameras and tracked markers",
         };
-        println!(
+        output::line(format_args!(
             "Robots: {}, each with {eyes}. They get to know the table first; then things come and go.",
             self.world.robots
-        );
+        ))?;
 
         let (stopper, stop) = watch::channel(false);
         let signals = stop_signal()?;
@@ -105,9 +108,9 @@ impl Demo {
         served.send_replace(true);
         service.await.context("the service failed")??;
         let summary = driven?;
-        println!("{summary}");
+        output::line(&summary)?;
         if self.json {
-            println!("{}", serde_json::to_string(&summary)?);
+            output::line(serde_json::to_string(&summary)?)?;
         }
         Ok(())
     }

@@ -21,6 +21,7 @@ use nalgebra::Point3;
 use serde::Serialize;
 use tempfile::TempDir;
 
+use super::{Usage, output};
 use crate::{
     config::{Evidence, Preset, Settings},
     dataset::{self, Recording},
@@ -102,13 +103,13 @@ impl FromStr for Ball {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let numbers: Vec<f64> = text
+        let numbers: Option<Vec<f64>> = text
             .split(',')
-            .filter_map(|word| word.trim().parse().ok())
-            .filter(|number: &f64| number.is_finite())
+            .map(|word| word.trim().parse().ok())
+            .map(|number: Option<f64>| number.filter(|number| number.is_finite()))
             .collect();
-        match numbers[..] {
-            [x, y, z, radius_m] if radius_m > 0.0 => Ok(Self(Ignored {
+        match numbers.as_deref() {
+            Some(&[x, y, z, radius_m]) if radius_m > 0.0 => Ok(Self(Ignored {
                 center_in_world: Point3::new(x, y, z),
                 radius_m,
             })),
@@ -173,10 +174,10 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         .context("name a recording to evaluate, or --depth")?;
     // Dropped, and so removed, at the end.
     let is_simulated = dir == Path::new(SIMULATED);
-    anyhow::ensure!(
-        is_simulated || !arguments.rig,
-        "--rig is for `simulated`: a recording has the depth that it has"
-    );
+    if arguments.rig && !is_simulated {
+        let why = "--rig is for `simulated`: a recording has the depth that it has";
+        return Err(Usage(why).into());
+    }
     let truth = if arguments.rig {
         Truth::Computed(depth_range(&settings))
     } else {
@@ -250,11 +251,10 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
             "settings": settings,
             "methods": outcomes,
         });
-        println!("{report}");
+        output::line(report)
     } else {
-        print!("{}", tables(&outcomes));
+        output::lines(tables(&outcomes))
     }
-    Ok(())
 }
 
 fn beside_differencing(settings: &Settings) -> Vec<Trial> {

@@ -17,6 +17,7 @@ use tokio::{
     time::Instant,
 };
 
+use super::output;
 use crate::{
     model::{
         frame::{DepthSource, Frame, RgbImage, RigFrame, Source},
@@ -200,7 +201,7 @@ pub async fn drive(
         summary: Summary::default(),
     };
     while let Some(item) = news.recv().await {
-        desk.take(item);
+        desk.take(item)?;
     }
     while let Some(ended) = cameras.join_next().await {
         ended.context("a simulated camera failed")??;
@@ -221,7 +222,7 @@ struct Desk {
 }
 
 impl Desk {
-    fn take(&mut self, news: News) {
+    fn take(&mut self, news: News) -> anyhow::Result<()> {
         match news {
             News::Published { late } => {
                 self.summary.frames += 1;
@@ -233,7 +234,7 @@ impl Desk {
                 answer: Answer::Report(report),
             } => {
                 self.summary.reports += 1;
-                self.judge_report(station, &capture, &report);
+                self.judge_report(station, &capture, &report)?;
             }
             News::Answered {
                 station,
@@ -248,9 +249,15 @@ impl Desk {
                 );
             }
         }
+        Ok(())
     }
 
-    fn judge_report(&mut self, station: usize, capture: &Capture, report: &proto::SurpriseReport) {
+    fn judge_report(
+        &mut self,
+        station: usize,
+        capture: &Capture,
+        report: &proto::SurpriseReport,
+    ) -> anyhow::Result<()> {
         let regions: Vec<(u64, PixelBox)> = report
             .regions
             .iter()
@@ -274,7 +281,7 @@ impl Desk {
             let place = region.center_in_world.map_or_else(String::new, |at| {
                 format!(" at ({:+.2}, {:+.2}, {:+.2}) m", at.x, at.y, at.z)
             });
-            println!(
+            output::line(format_args!(
                 "{}/{} frame {}: surprised by {:.1} nats{place}, pixels {}..{} x {}..{} - {}",
                 report.robot,
                 report.camera,
@@ -285,8 +292,9 @@ impl Desk {
                 pixels.y_min,
                 pixels.y_max,
                 reason.unwrap_or("nothing changed here"),
-            );
+            ))?;
         }
+        Ok(())
     }
 }
 

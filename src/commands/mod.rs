@@ -10,6 +10,8 @@ pub mod fleet;
 
 pub mod options;
 
+pub mod output;
+
 pub mod query;
 
 pub mod replay;
@@ -59,8 +61,20 @@ impl Arguments {
     }
 }
 
-/// 64 for a wrong configuration, 1 for everything else; wrong arguments are clap's 2.
+/// Arguments that do not go together, where only the command can tell.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Usage(&'static str);
+
+/// 64 for a wrong configuration, 2 for wrong arguments, as clap's, 1 for everything else, and 0 where only the reader of
+/// what was printed has gone.
 pub fn exit_code(error: &anyhow::Error) -> u8 {
+    if output::is_closed(error) {
+        return 0;
+    }
+    if error.is::<Usage>() {
+        return 2;
+    }
     let configuration = error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || matches!(

@@ -11,6 +11,7 @@ use crate::{
         access::{HttpAccess, Token},
         session::ZenohOptions,
     },
+    wire::keys::is_id,
 };
 
 /// The science's and the service's settings.
@@ -41,7 +42,11 @@ impl SettingsOptions {
                 })
             })
             .transpose()?;
-        Settings::layered(self.preset, file.as_deref(), &self.set)
+        let settings = Settings::layered(self.preset, file.as_deref(), &self.set)?;
+        match settings.robots.keys().find(|robot| !is_id(robot)) {
+            Some(robot) => Err(ConfigError::Robot(robot.clone())),
+            None => Ok(settings),
+        }
     }
 }
 

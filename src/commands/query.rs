@@ -6,9 +6,10 @@ use std::{
     str::FromStr,
 };
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use clap::{Subcommand, ValueEnum};
 
+use super::{output, replay::id};
 use crate::{
     config::ConfigError,
     model,
@@ -49,7 +50,7 @@ enum Question {
 #[derive(Debug, clap::Args)]
 struct Place {
     /// The place asked about.
-    #[arg(long)]
+    #[arg(long, value_parser = id)]
     place: String,
     /// The Zenoh key below which the service is.
     #[arg(long, value_name = "KEY", default_value = "surprised")]
@@ -218,8 +219,7 @@ impl Query {
 
 fn print(json: &[u8]) -> anyhow::Result<()> {
     let value: serde_json::Value = serde_json::from_slice(json)?;
-    println!("{}", serde_json::to_string_pretty(&value)?);
-    Ok(())
+    output::line(serde_json::to_string_pretty(&value)?)
 }
 
 impl Place {
@@ -241,9 +241,6 @@ impl Place {
     fn check(&self) -> anyhow::Result<()> {
         if !keys::is_root(&self.root) {
             return Err(ConfigError::Root(self.root.clone()).into());
-        }
-        if !keys::is_id(&self.place) {
-            bail!("--place {}: a place is [a-z0-9_-]+", self.place);
         }
         Ok(())
     }
@@ -324,8 +321,7 @@ impl Evaluate {
         let answer = self.place.ask_with("evaluate", "", Some(bytes)).await?;
         let reply: proto::EvaluateReply = decode::message(&answer)?;
         let report = reply.report.context("the reply has no report")?;
-        println!("{}", serde_json::to_string_pretty(&encode::json(&report))?);
-        Ok(())
+        output::line(serde_json::to_string_pretty(&encode::json(&report))?)
     }
 }
 
@@ -419,12 +415,11 @@ impl Prior {
         let reply: proto::PriorReply = decode::message(&answer)?;
         let png = picture::plane_png(&reply, plane).context("the reply has no such plane")?;
         fs::write(&self.out, png).with_context(|| self.out.display().to_string())?;
-        println!(
+        output::line(format_args!(
             "{}: {:.1} % of the pixels are known, from viewpoints {:?}",
             self.out.display(),
             100.0 * reply.covered,
             reply.viewpoints_used
-        );
-        Ok(())
+        ))
     }
 }

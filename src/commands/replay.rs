@@ -9,6 +9,7 @@ use std::{
 use anyhow::{Context, ensure};
 use tokio::time::Instant;
 
+use super::output;
 use crate::{
     dataset::Recording,
     service::{
@@ -23,6 +24,8 @@ use crate::{
 
 /// To find a service, and to hear about a frame. Far longer than any frame takes.
 const PATIENCE: Duration = Duration::from_secs(10);
+/// To hear from the service that writes the place when one that only reads it has refused the frame.
+const WRITER_PATIENCE: Duration = Duration::from_secs(1);
 const RATE_MIN_HZ: f64 = 0.01;
 const RATE_MAX_HZ: f64 = 1000.0;
 
@@ -92,14 +95,14 @@ struct Tally {
 }
 
 impl Tally {
-    fn take(&mut self, answer: &Answer) {
+    fn take(&mut self, answer: &Answer) -> anyhow::Result<()> {
         match answer {
             Answer::Report(report) => {
                 self.reports += 1;
                 self.regions += report.regions.len();
                 self.surprising += usize::from(!report.regions.is_empty());
                 for region in &report.regions {
-                    println!("{}", region_line(report.sequence, region));
+                    output::line(region_line(report.sequence, region))?;
                 }
             }
             Answer::Rejected(rejection) => {
@@ -110,19 +113,29 @@ impl Tally {
                 );
             }
         }
+        Ok(())
     }
 
     /// Waits for what the service says about a frame, and says so where it says nothing.
-    async fn hear_about(&mut self, robot: &mut Robot, sequence: u64) {
-        let end = Instant::now() + PATIENCE;
+    async fn hear_about(&mut self, robot: &mut Robot, sequence: u64) -> anyhow::Result<()> {
+        let mut end = Instant::now() + PATIENCE;
+        let mut is_answered = false;
         while let Some(answer) = robot.answer(end - Instant::now()).await {
-            self.take(&answer);
-            if answer.sequence() == sequence {
-                return;
+            self.take(&answer)?;
+            if answer.sequence() != sequence {
+                continue;
             }
+            if !answer.is_of_a_reader() {
+                return Ok(());
+            }
+            is_answered = true;
+            end = end.min(Instant::now() + WRITER_PATIENCE);
         }
-        self.unanswered += 1;
-        eprintln!("frame {sequence}: neither a report nor a rejection within {PATIENCE:?}");
+        if !is_answered {
+            self.unanswered += 1;
+            eprintln!("frame {sequence}: neither a report nor a rejection within {PATIENCE:?}");
+        }
+        Ok(())
     }
 }
 
@@ -172,17 +185,17 @@ impl Replay {
                 };
                 let due = started + Duration::from_secs_f64(due_s);
                 while let Some(answer) = robot.answer(due - Instant::now()).await {
-                    tally.take(&answer);
+                    tally.take(&answer)?;
                 }
             }
             robot.publish(&frame, file).await?;
             tally.frames += 1;
             // The newest frame always gets its turn: when the last is answered, no more answers come.
             if self.lockstep || tally.frames == recording.entries.len() {
-                tally.hear_about(&mut robot, frame.sequence).await;
+                tally.hear_about(&mut robot, frame.sequence).await?;
             }
         }
-        println!("{tally}");
+        output::line(&tally)?;
         if recording.skipped > 0 {
             eprintln!(
                 "{} images without depth or pose were left out",

@@ -6,6 +6,7 @@ use tokio::sync::watch;
 
 use super::{
     fleet::{self, Network, PaceOptions, Sensors, WorldOptions},
+    output,
     replay::id,
 };
 use crate::{service::session::ZenohOptions, simulation::write};
@@ -55,8 +56,7 @@ impl Simulate {
                     .unwrap_or(WRITTEN_MAX.max(script.frames.unwrap_or(0))),
             );
             let summary = write::recording(&folder, &script, &options)?;
-            println!("{}: {summary:?}", folder.display());
-            return Ok(());
+            return output::line(format_args!("{}: {summary:?}", folder.display()));
         }
         let sensors = if self.depth {
             Sensors::Depth
@@ -83,9 +83,9 @@ impl Simulate {
             stop,
         )
         .await?;
-        println!("{summary}");
+        output::line(&summary)?;
         if self.json {
-            println!("{}", serde_json::to_string(&summary)?);
+            output::line(serde_json::to_string(&summary)?)?;
         }
         Ok(())
     }

@@ -2,6 +2,9 @@
 
 use super::frame::FrameError;
 
+/// Another service writes this place.
+pub const PLACE_HELD: &str = "place_held";
+
 /// Says what is wrong and what to do. The memory is as it was before.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{detail}")]

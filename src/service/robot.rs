@@ -18,7 +18,7 @@ use crate::{
     model::{
         camera::{Calibration, RigCalibration},
         frame::{Frame, RigFrame},
-        refusal::Refusal,
+        refusal::{PLACE_HELD, Refusal},
     },
     wire::{
         decode, encode,
@@ -54,6 +54,11 @@ impl Answer {
             Self::Report(report) => report.sequence,
             Self::Rejected(rejection) => rejection.sequence,
         }
+    }
+
+    /// Whether it comes from a service that only reads the place: the one that writes it may answer as well.
+    pub fn is_of_a_reader(&self) -> bool {
+        matches!(self, Self::Rejected(rejection) if rejection.code == PLACE_HELD)
     }
 }
 

@@ -101,6 +101,11 @@ pub fn every_camera(root: &str, leaf: &str) -> String {
     format!("{root}/*/*/*/{leaf}")
 }
 
+/// The reports on every camera of a place.
+pub fn every_report(root: &str, place: &str) -> String {
+    format!("{root}/{place}/*/*/{REPORT}")
+}
+
 /// The tokens of every camera.
 pub fn every_live_camera(root: &str) -> String {
     format!("{root}/*/@live/robot/*/*")

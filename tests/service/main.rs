@@ -40,4 +40,6 @@ mod busy;
 
 mod pages;
 
+mod standing_by;
+
 mod stopping;

@@ -43,6 +43,7 @@ pub type Samples = Subscriber<FifoChannelHandler<Sample>>;
 pub struct Rig {
     pub session: Session,
     pub http: SocketAddr,
+    endpoints: Vec<String>,
     stop: oneshot::Sender<()>,
     service: JoinHandle<Result<(), ServeError>>,
 }
@@ -54,6 +55,15 @@ impl Rig {
 
     /// Where its memory lasts.
     pub async fn remembering(settings: &[&str], store: Option<Store>) -> Self {
+        Self::in_network(settings, store, &[]).await
+    }
+
+    /// On one network with another one, which hears what this session puts.
+    pub async fn beside(other: &Self, store: Option<Store>) -> Self {
+        Self::in_network(&[], store, &other.endpoints).await
+    }
+
+    async fn in_network(settings: &[&str], store: Option<Store>, others: &[String]) -> Self {
         let settings: Vec<String> = settings.iter().map(|&pair| pair.to_owned()).collect();
         let alone = ["scouting/gossip/enabled:false".to_owned()];
         let service = Service::start(Options {
@@ -65,6 +75,7 @@ impl Rig {
             http_access: HttpAccess::default(),
             zenoh: ZenohOptions {
                 listen: vec!["tcp/127.0.0.1:0".to_owned()],
+                connect: others.to_vec(),
                 cfg: alone.to_vec(),
                 ..ZenohOptions::default()
             },
@@ -72,9 +83,11 @@ impl Rig {
         .await
         .expect("the service starts");
         let http = service.http_addr().expect("HTTP is on");
+        let endpoints = service.locators().to_vec();
+        let everywhere = [&endpoints[..], others].concat();
         let mut config = zenoh::Config::default();
         for (key, value) in [
-            ("connect/endpoints", format!("{:?}", service.locators())),
+            ("connect/endpoints", format!("{everywhere:?}")),
             ("listen/endpoints", "[]".to_owned()),
             ("scouting/multicast/enabled", "false".to_owned()),
             ("scouting/gossip/enabled", "false".to_owned()),
@@ -89,6 +102,7 @@ impl Rig {
         Self {
             session,
             http,
+            endpoints,
             stop,
             service,
         }

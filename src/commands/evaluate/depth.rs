@@ -6,6 +6,7 @@ use rayon::ThreadPool;
 use serde_json::json;
 
 use crate::{
+    commands::output,
     config::Settings,
     evaluation::{
         simulated_depth,
@@ -33,8 +34,7 @@ pub fn run(what: &str, settings: &Settings, seed: u64, as_json: bool) -> anyhow:
         .build()?;
     if what == SIMULATED {
         let pool = Arc::new(pool);
-        pool.install(|| simulated(settings, seed, as_json, &pool));
-        Ok(())
+        pool.install(|| simulated(settings, seed, as_json, &pool))
     } else {
         pool.install(|| stereo_folder(Path::new(what), settings.depth_labels, as_json))
     }
@@ -51,8 +51,7 @@ fn stereo_folder(folder: &Path, labels: usize, as_json: bool) -> anyhow::Result<
         report["most_disparity_px"] = json!(range.near);
         report["labels"] = json!(range.labels);
         report["two_cameras"] = json!(two);
-        println!("{report}");
-        return Ok(());
+        return output::line(report);
     }
     let mut table = Table::new(&[
         "cameras",
@@ -76,11 +75,15 @@ fn stereo_folder(folder: &Path, labels: usize, as_json: bool) -> anyhow::Result<
             number(Some(bad.mean_error_px), 3),
         ]);
     }
-    print!("{table}");
-    Ok(())
+    output::lines(table)
 }
 
-fn simulated(settings: &Settings, seed: u64, as_json: bool, pool: &Arc<ThreadPool>) {
+fn simulated(
+    settings: &Settings,
+    seed: u64,
+    as_json: bool,
+    pool: &Arc<ThreadPool>,
+) -> anyhow::Result<()> {
     let script = Script::tabletop(seed);
     let end = script.frames.unwrap_or(0);
     let frames: Vec<u64> = (SIMULATED_FIRST..end)
@@ -92,8 +95,7 @@ fn simulated(settings: &Settings, seed: u64, as_json: bool, pool: &Arc<ThreadPoo
     if as_json {
         let mut report = json!(within);
         report["along_the_way"] = json!(along_the_way);
-        println!("{report}");
-        return;
+        return output::line(report);
     }
     let mut table = Table::new(&[
         "frames",
@@ -125,5 +127,5 @@ fn simulated(settings: &Settings, seed: u64, as_json: bool, pool: &Arc<ThreadPoo
         number(within.invalid, 2),
         number(within.median_error, 2),
     ]);
-    print!("{table}");
+    output::lines(table)
 }

@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use crate::{
+    commands::output,
     config::Settings,
     dataset::Recording,
     engine::Engines,
@@ -54,19 +55,17 @@ pub fn run(
             .iter()
             .map(|(name, held_out)| json!({ "recording": name, "held_out": held_out }))
             .collect();
-        println!("{}", json!(results));
-        return Ok(());
+        return output::line(json!(results));
     }
     for (name, held_out) in &results {
-        println!(
+        output::line(format_args!(
             "{name}: {} frames learnt into {} viewpoints, {} left out; found {:.1} mm and {:.2} degrees from their poses",
             held_out.learnt,
             held_out.viewpoints,
             held_out.left_out,
             1000.0 * held_out.correction_m,
             held_out.correction_rad.to_degrees()
-        );
+        ))?;
     }
-    print!("{table}");
-    Ok(())
+    output::lines(table)
 }

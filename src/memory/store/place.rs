@@ -18,7 +18,12 @@ use super::{
 };
 use crate::{
     memory::{Memory, residency::Change},
-    model::{frame::Source, mode::Modes, pose::Pose, refusal::Refusal},
+    model::{
+        frame::Source,
+        mode::Modes,
+        pose::Pose,
+        refusal::{PLACE_HELD, Refusal},
+    },
 };
 
 /// How far ahead of a robot viewpoints are loaded, and how many more than a frame recalls.
@@ -432,7 +437,7 @@ impl PlaceStore {
 
 fn held(holder: &str) -> Refusal {
     Refusal::new(
-        "place_held",
+        PLACE_HELD,
         format!(
             "this place is written by another service ({holder}); this one answers questions and takes over when that one is gone"
         ),

@@ -2,10 +2,15 @@
 
 use std::time::Instant;
 
-use super::{Desk, Worker, telling::snapshot};
+use super::{Desk, Worker, telling::snapshot, writer::Writer};
 use crate::{
     memory::store::PlaceStore,
-    model::{frame::Source, mode::Mode, pose::Pose, refusal::Refusal},
+    model::{
+        frame::Source,
+        mode::Mode,
+        pose::Pose,
+        refusal::{PLACE_HELD, Refusal},
+    },
     service::{
         camera::{Camera, Refused, Turn, unpack},
         inbox::Aside,
@@ -178,6 +183,9 @@ impl Desk {
         let may_learn = self.worker.memory.as_ref().map(PlaceStore::may_learn);
         self.sync_modes();
         let mode = self.mode(source);
+        if matches!(may_learn, Some(Ok(()))) {
+            self.writer = None;
+        }
         if mode == Mode::Learn {
             may_learn.unwrap_or(Ok(()))?;
         }
@@ -225,8 +233,25 @@ impl Desk {
         Ok(())
     }
 
+    /// Whether the service that writes the place reports on this network: then the sender hears from it, and a refusal
+    /// beside each report would only confuse.
+    fn writer_answers(&mut self) -> bool {
+        if self.writer.is_none() {
+            let Worker {
+                session,
+                root,
+                place,
+                ..
+            } = &self.worker;
+            self.writer = Writer::listen(session, root, place).ok();
+        }
+        self.writer.as_ref().is_some_and(Writer::is_heard)
+    }
+
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
         let root = self.worker.root.clone();
+        let is_told =
+            leaf == keys::FRAME && refused.refusal.code == PLACE_HELD && self.writer_answers();
         *self.refused_by.entry(refused.refusal.code).or_default() += 1;
         let Some(camera) = self.camera(source) else {
             return;
@@ -245,7 +270,9 @@ impl Desk {
         } else {
             tracing::debug!(code = refusal.code, "refused on {key}: {refusal}");
         }
-        camera.publisher.refused(&key, &refusal, stamp_ns, sequence);
+        if !is_told {
+            camera.publisher.refused(&key, &refusal, stamp_ns, sequence);
+        }
         camera.status.last_refusal = Some(format!("{}: {refusal}", refusal.code));
     }
 }

@@ -14,10 +14,13 @@ mod memory;
 
 mod telling;
 
+mod writer;
+
 use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use tokio::sync::{mpsc, watch};
 
+use self::writer::Writer;
 use super::{
     ask::Ask,
     camera::Camera,
@@ -76,6 +79,8 @@ struct Desk {
     /// The last of each camera, also of cameras that made room for others or have not come again since the start.
     calibrations: BTreeMap<Source, RigCalibration>,
     asks: AskCounters,
+    /// While another service writes the place and frames are refused.
+    writer: Option<Writer>,
 }
 
 #[derive(Debug, Default)]
@@ -105,6 +110,7 @@ impl Worker {
             modes: Modes::default(),
             calibrations: BTreeMap::new(),
             asks: AskCounters::default(),
+            writer: None,
             worker: self,
         };
         if let Some(memory) = &desk.worker.memory {
