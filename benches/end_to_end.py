@@ -1,7 +1,8 @@
 """From published frame to received report, and how many robots a machine sustains.
 
 Needs: pip install -r tests/python/requirements.txt; and `cargo build --release`.
-Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10] [--noise 10] [--stored]`.
+Run as `python benches/end_to_end.py [--preset paper] [--seconds 10] [--first 10] [--step 10] [--noise 10] [--stored]
+[--set NAME=VALUE]`.
 
 Robots publish 320x240 frames over Zenoh (TCP on this machine), seven a second each: a JPEG, depth as 16-bit millimetres
 with noise, a pose. `--noise` is of the pictures, grey levels: with 10 of them a JPEG of quality 90 is as large as a
@@ -56,8 +57,9 @@ from surprised_proto import Frame, Image, SurpriseReport, encoding  # noqa: E402
 
 WIDTH, HEIGHT, FOCAL, DISTANCE_M = 320, 240, 300.0, 2.0
 FPS = 7.0
-# Pixels that the wall moves from one frame to the next, there and back.
-SHIFT, FRAMES = 3, 32
+# Pixels that the wall moves from one frame to the next, there and back. No robot moves by whole ones: then every pixel would
+# lie on the border of two quads and be drawn for both.
+SHIFT, FRAMES = np.array([2.9, 0.3]), 32
 WARM_UP_S = 3.0
 # Longer than this for a report is never.
 PATIENCE_S = 3.0
@@ -66,13 +68,16 @@ PATIENCE_S = 3.0
 def frames(noise: float) -> tuple[list[bytes], float]:
     """Frames without stamp and sequence: a camera that moves along a wall. And the mean size of their JPEGs, bytes."""
     rng = np.random.default_rng(1)
-    width = WIDTH + SHIFT * FRAMES
-    coarse = rng.integers(40, 215, (HEIGHT // 8, width // 8 + 1, 3), np.uint8)
-    wall = np.asarray(Picture.fromarray(coarse).resize((width, HEIGHT), Picture.Resampling.BICUBIC))
+    width, height = (np.array([WIDTH, HEIGHT]) + SHIFT * FRAMES).astype(int) + 1
+    coarse = rng.integers(40, 215, (height // 8, width // 8, 3), np.uint8)
+    wall = Picture.fromarray(coarse).resize((width, height), Picture.Resampling.BICUBIC)
     made, jpeg_bytes = [], 0
     for index in range(FRAMES):
-        shift = SHIFT * index
-        seen = wall[:, shift : shift + WIDTH] + rng.normal(0.0, noise, (HEIGHT, WIDTH, 3))
+        x, y = SHIFT * index
+        moved = wall.transform(
+            (WIDTH, HEIGHT), Picture.Transform.AFFINE, (1, 0, x, 0, 1, y), Picture.Resampling.BICUBIC
+        )
+        seen = moved + rng.normal(0.0, noise, (HEIGHT, WIDTH, 3))
         file = io.BytesIO()
         Picture.fromarray(seen.round().clip(0, 255).astype(np.uint8)).save(file, "jpeg", quality=90)
         jpeg_bytes += len(file.getvalue())
@@ -81,7 +86,8 @@ def frames(noise: float) -> tuple[list[bytes], float]:
             image=Image(encoding="jpeg", width=WIDTH, height=HEIGHT, data=file.getvalue()),
             depth=Image(encoding="16UC1", width=WIDTH, height=HEIGHT, data=depth.tobytes()),
         )
-        message.world_from_camera.position.x = shift * DISTANCE_M / FOCAL
+        message.world_from_camera.position.x = x * DISTANCE_M / FOCAL
+        message.world_from_camera.position.y = y * DISTANCE_M / FOCAL
         message.world_from_camera.orientation.w = 1.0
         lens = message.calibration.middle
         lens.width, lens.height, lens.fx, lens.fy = WIDTH, HEIGHT, FOCAL, FOCAL
@@ -231,7 +237,8 @@ def describe(seconds: list[float]) -> str:
 def serve(options, robots: int, bodies: list[bytes]) -> Run:
     folder = tempfile.TemporaryDirectory()
     memory = Path(folder.name).as_uri() if options.stored else "memory://"
-    daemon = Daemon("--preset", options.preset, "--engine", "cpu", "--memory", memory)
+    settings = [f"--set={pair}" for pair in options.set]
+    daemon = Daemon("--preset", options.preset, "--engine", "cpu", "--memory", memory, *settings)
     try:
         with open_session(daemon.endpoint) as session:
             places = min(robots, os.cpu_count() or 1)
@@ -249,6 +256,7 @@ def main() -> None:
     parser.add_argument("--step", type=int, default=10)
     parser.add_argument("--noise", type=float, default=0.0)
     parser.add_argument("--stored", action="store_true")
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
     parser.add_argument("--echo", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.echo:

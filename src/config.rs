@@ -72,6 +72,10 @@ pub struct Settings {
     /// How many nearest viewpoints are recalled (section III-D: seven). At most 16: votes are bit masks and the
     /// work grows with it.
     pub views: usize,
+    /// Of these, how many are recalled of a frame that others wait for, or that took the place of one nobody had time
+    /// for. With four the cup of `tabletop` is found as well as with seven, and a frame that is left out finds nothing.
+    /// As many as `views`: a frame never costs less.
+    pub views_busy: usize,
     /// Views farther than this, metres of view distance, are left out beyond the three nearest, and also among these where
     /// one is thirty times nearer: where viewpoints are sparse the seventh sees another side of things, and edges flash.
     /// 1e6 = no limit, as in the paper.
@@ -174,6 +178,7 @@ impl Settings {
     pub fn paper() -> Self {
         Self {
             xi: 0.003,
+            views_busy: 7,
             view_distance_max_m: 1e6,
             refine_pose: false,
             depth_vote: false,
@@ -198,6 +203,7 @@ impl Settings {
             sigma_min: 0.05,
             sigma_max: 5.0,
             views: 7,
+            views_busy: 4,
             view_distance_max_m: 0.16,
             metres_per_radian: 1.0,
             mesh_cut: 0.05,
@@ -335,6 +341,7 @@ impl Settings {
         within("sigma_min", self.sigma_min, 1e-3, 100.0)?;
         within("sigma_max", self.sigma_max, self.sigma_min, 1000.0)?;
         within("views", self.views, 1, 16)?;
+        within("views_busy", self.views_busy, 1, 16)?;
         within("view_distance_max_m", self.view_distance_max_m, 0.0, 1e6)?;
         within("metres_per_radian", self.metres_per_radian, 0.0, 100.0)?;
         within("mesh_cut", self.mesh_cut, 1e-3, 1.0)?;

@@ -61,6 +61,15 @@ pub struct PriorAt {
     pub viewpoints_used: ArrayVec<u64, VIEWS_MAX>,
 }
 
+/// What a frame may cost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Effort {
+    /// All of [`Settings::views`] are recalled.
+    Whole,
+    /// [`Settings::views_busy`] of them.
+    Hurried,
+}
+
 /// A part of a frame's way. A pipeline has no clock: it says when a part has ended, and who has a clock may time it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Stage {
@@ -210,16 +219,17 @@ impl Pipeline {
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process_in(&mut self, mode: Mode, frame: &Frame) -> Result<Report, FrameError> {
-        self.process_staged(mode, frame, &mut |_| {})
+        self.process_staged(mode, Effort::Whole, frame, &mut |_| {})
     }
 
-    /// The same, telling `ended` of every stage.
+    /// The same with less effort if need be, telling `ended` of every stage.
     ///
     /// # Errors
     /// A frame that cannot be used; nothing has changed then.
     pub fn process_staged(
         &mut self,
         mode: Mode,
+        effort: Effort,
         frame: &Frame,
         ended: Ended,
     ) -> Result<Report, FrameError> {
@@ -232,7 +242,7 @@ impl Pipeline {
         };
         let before = (mode == Mode::Freeze).then(|| camera.visit.clone());
         let learn = mode == Mode::Learn;
-        let looked = self.look(frame, &mut camera.visit, learn, ended);
+        let looked = self.look(frame, effort, &mut camera.visit, learn, ended);
         let looked = looked.map(|mut report| {
             camera
                 .follower
@@ -355,7 +365,7 @@ impl Pipeline {
         let mut visit = camera
             .map(|camera| camera.visit.clone())
             .unwrap_or_default();
-        self.look(frame, &mut visit, false, &mut |_| {})
+        self.look(frame, Effort::Whole, &mut visit, false, &mut |_| {})
     }
 
     /// The prior at a pose, as somebody would see it who was not here lately.
@@ -399,6 +409,7 @@ impl Pipeline {
     fn look(
         &mut self,
         frame: &Frame,
+        effort: Effort,
         visit: &mut Visit,
         learn: bool,
         ended: Ended,
@@ -408,10 +419,15 @@ impl Pipeline {
         self.engine.observe(&frame.image, &mut work.observation);
 
         self.select(&frame.world_from_camera, &mut work.selected);
-        let used = self.ids(&work.selected);
+        let mut used = self.ids(&work.selected);
+        // A visit goes on, and the frame is learnt where it would be, however much effort is made.
         visit.select(&used);
+        if effort == Effort::Hurried {
+            used.truncate(self.settings.views_busy);
+        }
 
-        let views = recall_views(&self.memory, &self.settings, &work.selected, visit);
+        let recalled = &work.selected[..used.len()];
+        let views = recall_views(&self.memory, &self.settings, recalled, visit);
         let question = Question {
             views: &views,
             intrinsics: &frame.intrinsics,

@@ -16,7 +16,7 @@ use surprised::{
         pose::Pose,
         report::{PixelBox, Report},
     },
-    pipeline::{Pipeline, Stage},
+    pipeline::{Effort, Pipeline, Stage},
     pool::Pool,
 };
 
@@ -289,7 +289,7 @@ fn how_many_others_compute_says_on_which_thread_a_frame_is_but_nothing_of_what_i
                     thread = Some(std::thread::current().id());
                 }
             };
-            let report = pipeline.process_staged(Mode::Learn, &frame, &mut ended);
+            let report = pipeline.process_staged(Mode::Learn, Effort::Whole, &frame, &mut ended);
             reports.push(report.expect("a good frame"));
             let is_here = thread.expect("it was refined") == here;
             assert_eq!(is_here, on_own_thread, "beside {} others", others.len());
@@ -302,6 +302,41 @@ fn how_many_others_compute_says_on_which_thread_a_frame_is_but_nothing_of_what_i
             .windows(2)
             .all(|pair| same_memory(&pair[0], &pair[1]))
     );
+}
+
+#[test]
+fn a_hurried_frame_is_compared_with_the_nearest_and_learnt_where_it_would_be() {
+    let settings = Settings {
+        views_busy: 2,
+        ..Settings::robust()
+    };
+    let mut pipelines = [(); 2].map(|()| Pipeline::new(settings.clone(), pool(1)));
+    let mut hurried = 0;
+    for step in 0..STEPS {
+        let frame = frame(&place(false), &arc(step, 0.002), step as u64 + 1);
+        let effort = [Effort::Whole, Effort::Hurried];
+        let [whole, fewer] = [0, 1].map(|index| {
+            let pipeline: &mut Pipeline = &mut pipelines[index];
+            pipeline
+                .process_staged(Mode::Learn, effort[index], &frame, &mut |_| {})
+                .expect("a good frame")
+        });
+        let known = whole.viewpoints_used.len();
+        assert_eq!(
+            fewer.viewpoints_used[..],
+            whole.viewpoints_used[..known.min(2)]
+        );
+        assert_eq!(fewer.viewpoint_id, whole.viewpoint_id);
+        hurried += usize::from(known > 2);
+    }
+    assert!(hurried > STEPS / 2, "{hurried} frames had more than two");
+    // Asked without hurry, both recall as many again.
+    let frame = frame(&place(false), &arc(STEPS / 2, 0.0), STEPS as u64 + 1);
+    let [first, second] = pipelines.each_mut().map(|pipeline| {
+        let report = pipeline.process(&frame).expect("a good frame");
+        report.viewpoints_used
+    });
+    assert_eq!(first, second);
 }
 
 #[test]

@@ -34,5 +34,8 @@ with zenoh.open(config) as session:
     for reply in session.get(KEY, timeout=10.0):
         if reply.ok is not None:
             tell(reply.ok)
-    while True:
-        tell(changes.get())
+    try:
+        while True:
+            tell(changes.get())
+    except KeyboardInterrupt:
+        pass

@@ -119,8 +119,10 @@ fn check_size(calibration: &RigCalibration, limits: Limits) -> Result<(), Refusa
 
 /// A frame whose pose or calibration may still come.
 pub struct Waiting {
-    frame: PackedFrame,
-    arrived: Instant,
+    pub frame: PackedFrame,
+    pub arrived: Instant,
+    /// Frames that nobody had time for before it.
+    pub replaced: u64,
 }
 
 /// Whether a waiting frame's turn can come.
@@ -129,8 +131,7 @@ pub struct Waiting {
     reason = "one is made and taken apart a frame"
 )]
 pub enum Turn {
-    /// With when it came.
-    Ready(Pose, PackedFrame, Instant),
+    Ready(Pose, Waiting),
     /// Look again then, or when something has come.
     Until(Instant),
     Refused(Refused),
@@ -310,6 +311,7 @@ impl Camera {
         self.waiting = Some(Waiting {
             frame,
             arrived: arrival.arrived,
+            replaced,
         });
         Ok(())
     }
@@ -326,7 +328,7 @@ impl Camera {
         if self.calibration_at_hand().is_none() && self.calibration_asked.is_some_and(has_waited) {
             self.calibration = self.remembered.take();
         }
-        let Waiting { frame, arrived } = self.waiting.as_ref()?;
+        let Waiting { frame, arrived, .. } = self.waiting.as_ref()?;
         let refuse = |refusal| {
             Turn::Refused(Refused {
                 refusal,
@@ -360,8 +362,7 @@ impl Camera {
                 };
                 match pose {
                     TrackedPose::At(pose) => {
-                        let Waiting { frame, arrived } = self.waiting.take()?;
-                        return Some(Turn::Ready(pose, frame, arrived));
+                        return Some(Turn::Ready(pose, self.waiting.take()?));
                     }
                     TrackedPose::Never(refusal) => refuse(refusal),
                     TrackedPose::Later => {

@@ -26,6 +26,8 @@ pub struct PlaceTotals {
     pub place: String,
     /// Processed.
     pub frames: u64,
+    /// Of these, compared with `views_busy` viewpoints, because others waited.
+    pub frames_hurried: u64,
     /// Frames and what comes beside them.
     pub refused: u64,
     /// By code.

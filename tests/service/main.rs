@@ -8,6 +8,8 @@ mod reports;
 
 mod newest_wins;
 
+mod hurry;
+
 mod maps_on_demand;
 
 mod refusals;

@@ -18,7 +18,10 @@ use super::{
     problem::{Document, Problem, Refused},
 };
 use crate::{
-    model::frame::{RgbImage, Source},
+    model::{
+        frame::{RgbImage, Source},
+        refusal::Refusal,
+    },
     service::{
         ask::Snapshot,
         live::{CameraState, PlaceState},
@@ -54,13 +57,7 @@ pub async fn list(State(app): State<App>) -> axum::Json<PlaceNames> {
 }
 
 pub async fn known(app: &App, place: &str) -> Result<Arc<Place>, Problem> {
-    let known = app.parts.places.known(place).await;
-    known.map_err(|refusal| match refusal.code {
-        "unknown_place" => {
-            Problem::not_found("this place is unknown: it begins with its first frame")
-        }
-        _ => refusal.into(),
-    })
+    Ok(app.parts.places.known(place).await?)
 }
 
 /// A place and its cameras: state and counters
@@ -103,7 +100,7 @@ pub async fn camera(
         .cameras
         .iter()
         .find(|known| known.status.robot == robot && known.status.camera == camera)
-        .ok_or_else(|| Problem::not_found("no frame of this camera has come yet"))?;
+        .ok_or_else(|| Refusal::new("unknown_camera", "no frame of this camera has come yet"))?;
     Ok(axum::Json(json!({
         "status": camera,
         "report": camera.status.report.as_deref().map(encode::json),

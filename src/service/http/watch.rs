@@ -90,7 +90,8 @@ impl Drop for Client {
 ///
 /// `hello` once, then `state` (places and cameras that have changed, at most four times a second), `event` (an event that
 /// is new, has news, or has ended; with an id to resume from), and `reset` where messages were lost.
-#[utoipa::path(get, path = "/events", tag = "events", params(Which),
+#[utoipa::path(get, path = "/events", tag = "events",
+    params(Which, ("Last-Event-ID" = Option<String>, Header, description = "Where a stream that broke is to go on")),
     responses(
         (status = 200, body = String, content_type = "text/event-stream"),
         (status = "4XX", description = "No token", body = Document,

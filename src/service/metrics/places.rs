@@ -68,6 +68,11 @@ impl Collector for OfPlaces {
         out.counters("frames_processed", "Frames with a report", |place| {
             place.totals.frames
         })?;
+        out.counters(
+            "frames_hurried",
+            "Frames that were compared with fewer viewpoints because others waited",
+            |place| place.totals.frames_hurried,
+        )?;
         out.labelled(
             "frames_dropped",
             "Frames that a newer one replaced, or that never came",

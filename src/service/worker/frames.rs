@@ -11,19 +11,22 @@ use crate::{
         pose::Pose,
         refusal::{PLACE_HELD, Refusal},
     },
+    pipeline::Effort,
     service::{
-        camera::{Camera, Refused, Turn, unpack},
+        camera::{Camera, Refused, Turn, Waiting, unpack},
         inbox::Aside,
         publish::CameraPublisher,
         turns,
     },
     wire::{
-        decode::{self, PackedFrame},
-        encode,
+        decode, encode,
         keys::{self, CameraPath},
         proto,
     },
 };
+
+/// Two robots whose frames come at once are no sign that there is too much to do.
+const OTHERS_WAIT: usize = 2;
 
 impl Desk {
     /// The camera's entry, made when it is first heard of; `None` when the session is closing.
@@ -145,11 +148,12 @@ impl Desk {
                     wake = Some(wake.map_or(deadline, |wake| wake.min(deadline)));
                 }
                 Some(Turn::Refused(refused)) => self.refuse(&source, keys::FRAME, refused),
-                Some(Turn::Ready(pose, packed, arrived)) => {
+                Some(Turn::Ready(pose, frame)) => {
                     self.frames += 1;
                     camera.served = self.frames;
+                    let Waiting { frame: packed, .. } = &frame;
                     let (stamp_ns, sequence) = (packed.stamp_ns, packed.sequence);
-                    if let Err(refusal) = self.serve_frame(&source, pose, &packed, arrived) {
+                    if let Err(refusal) = self.serve_frame(&source, pose, &frame) {
                         self.frames -= 1;
                         self.refuse(
                             &source,
@@ -171,12 +175,29 @@ impl Desk {
         turns::Turn { served: None, wake }
     }
 
+    /// Less where others wait, or where the frame took the place of one nobody had time for: so that no more are left
+    /// out. A frozen camera is never hurried: its frames are judged the same however often they come.
+    fn effort(&self, mode: Mode, replaced: u64) -> Effort {
+        let settings = self.worker.pipeline.settings();
+        let may_hurry = mode != Mode::Freeze && settings.views_busy < settings.views;
+        let waiting = |camera: &&Camera| camera.waiting.is_some();
+        let others = self.cameras.values().filter(waiting).count();
+        if may_hurry && (replaced > 0 || others >= OTHERS_WAIT) {
+            Effort::Hurried
+        } else {
+            Effort::Whole
+        }
+    }
+
     fn serve_frame(
         &mut self,
         source: &Source,
         pose: Pose,
-        packed: &PackedFrame,
-        arrived: Instant,
+        Waiting {
+            frame: packed,
+            arrived,
+            replaced,
+        }: &Waiting,
     ) -> Result<(), Refusal> {
         self.may_recall()?;
         // Asked before the modes: whoever has become the place's writer has read what the last one was told.
@@ -189,6 +210,7 @@ impl Desk {
         if mode == Mode::Learn {
             may_learn.unwrap_or(Ok(()))?;
         }
+        let effort = self.effort(mode, *replaced);
         let mut stopwatch = self.stopwatches.start();
         let (limits, noise) = (self.limits, self.noise_default);
         let Some(camera) = self.cameras.get_mut(source) else {
@@ -206,7 +228,8 @@ impl Desk {
         if let Some(memory) = memory {
             memory.bring(pipeline.memory_mut(), &pose);
         }
-        let report = pipeline.process_staged(mode, &frame, &mut |stage| stopwatch.ended(stage))?;
+        let report =
+            pipeline.process_staged(mode, effort, &frame, &mut |stage| stopwatch.ended(stage))?;
         if let Some(memory) = memory {
             let held = pipeline.memory_mut();
             memory.sync(held);
@@ -217,7 +240,8 @@ impl Desk {
         let message = encode::report(&report, place, processing_seconds);
         camera.publisher.report(&message);
         camera.publisher.maps(&report, || pipeline.maps());
-        stopwatch.published(arrived);
+        stopwatch.published(*arrived);
+        self.frames_hurried += u64::from(effort == Effort::Hurried);
         camera.processed(
             frame.image,
             lenses,

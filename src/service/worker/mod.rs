@@ -70,6 +70,8 @@ struct Desk {
     /// Whose last frame the pipeline's maps are of.
     maps_of: Option<Source>,
     frames: u64,
+    /// Of these, compared with less effort.
+    frames_hurried: u64,
     /// Of cameras that made room for others, and what was refused.
     frames_lost_before: u64,
     refused_by: BTreeMap<&'static str, u64>,
@@ -104,6 +106,7 @@ impl Worker {
             cameras: BTreeMap::new(),
             maps_of: None,
             frames: 0,
+            frames_hurried: 0,
             frames_lost_before: 0,
             refused_by: BTreeMap::new(),
             stopwatches: self.metrics.stopwatches(&self.place),

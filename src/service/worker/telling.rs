@@ -90,6 +90,7 @@ impl Desk {
         let totals = PlaceTotals {
             place: self.worker.place.to_string(),
             frames: self.frames,
+            frames_hurried: self.frames_hurried,
             refused: self.refused_by.values().sum(),
             refused_by: self.refused_by.clone(),
             frames_lost: self.frames_lost_before + lost,
