@@ -393,14 +393,32 @@ fn robot_table<'a>(settings: &'a mut toml::Table, robot: &str) -> Option<&'a mut
         .as_table_mut()
 }
 
+/// With the kinds of values as a person would call them.
+fn in_words(error: &toml::de::Error) -> String {
+    let mut text = error.to_string();
+    for (kind, words) in [
+        ("expected usize", "expected a whole number"),
+        ("expected f32", "expected a number"),
+        ("expected f64", "expected a number"),
+        ("unit variant, expected string only", "expected a word"),
+    ] {
+        text = text.replace(kind, words);
+    }
+    text.trim_end().replace("\nin `", " in `")
+}
+
 #[derive(Debug, thiserror::Error)]
 pub enum ConfigError {
     #[error("{0}")]
     Memory(String),
-    #[error("settings: {0}")]
+    #[error("settings: {}", in_words(.0))]
     File(toml::de::Error),
-    #[error("{file}: {error}")]
-    Read { file: String, error: std::io::Error },
+    #[error("{option} {file}: {error}")]
+    Read {
+        option: &'static str,
+        file: String,
+        error: std::io::Error,
+    },
     #[error(
         "--root {0}: a root is a Zenoh key without wildcards, such as surprised or site/surprised"
     )]

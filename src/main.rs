@@ -3,7 +3,7 @@
 use std::{io::IsTerminal, process::ExitCode};
 
 use clap::Parser;
-use surprised::commands::{Arguments, exit_code};
+use surprised::commands::{Arguments, exit_code, explain};
 use tracing_subscriber::EnvFilter;
 
 fn main() -> ExitCode {
@@ -51,7 +51,7 @@ async fn run() -> ExitCode {
         Err(error) => {
             let code = exit_code(&error);
             if code != 0 {
-                eprintln!("surprised: {error:#}");
+                eprintln!("surprised: {}", explain(&error));
             }
             ExitCode::from(code)
         }

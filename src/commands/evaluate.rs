@@ -10,7 +10,6 @@ mod prior;
 use std::{
     fmt::Write as _,
     fs,
-    io::Write as _,
     path::{Path, PathBuf},
     str::FromStr,
     sync::Arc,
@@ -212,14 +211,11 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         }),
         first_run_only: false,
     };
-    // Before minutes of work that it would be lost with.
-    let csv_file = arguments
-        .csv
-        .as_deref()
-        .map(|path| {
-            fs::File::create(path).with_context(|| format!("cannot write {}", path.display()))
-        })
-        .transpose()?;
+    // Before minutes of work that would be lost. What is there already stays until there is something better.
+    if let Some(path) = &arguments.csv {
+        let opened = fs::OpenOptions::new().create(true).append(true).open(path);
+        opened.with_context(|| format!("cannot write {}", path.display()))?;
+    }
     let trials = if arguments.leave_one_out {
         leave_one_out(&settings)
     } else {
@@ -234,9 +230,9 @@ pub fn run(arguments: EvaluateArgs) -> anyhow::Result<()> {
         })
         .collect::<anyhow::Result<Vec<_>>>()?;
 
-    if let Some(mut file) = csv_file {
-        file.write_all(csv(&outcomes).as_bytes())
-            .context("cannot write the csv file")?;
+    if let Some(path) = &arguments.csv {
+        fs::write(path, csv(&outcomes))
+            .with_context(|| format!("cannot write {}", path.display()))?;
     }
     if let Some(folder) = &arguments.figures {
         let rows: Vec<(&str, &[FrameRow])> = outcomes

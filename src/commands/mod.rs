@@ -92,3 +92,50 @@ pub fn exit_code(error: &anyhow::Error) -> u8 {
     });
     if configuration { 64 } else { 1 }
 }
+
+/// What made a command fail, for people: every cause once, and none of them with the place in a library where it was made.
+pub fn explain(error: &anyhow::Error) -> String {
+    let mut told = String::new();
+    for cause in error.chain() {
+        let cause = without_origin(&cause.to_string());
+        if told.contains(&cause) {
+            continue;
+        }
+        if !told.is_empty() {
+            told += ": ";
+        }
+        told += &cause;
+    }
+    told
+}
+
+/// Zenoh's errors end with ` at /path/file.rs:line.`
+fn without_origin(text: &str) -> String {
+    let origin = text.split_once(" at /").and_then(|(what, origin)| {
+        let (_, after) = origin.split_once(".rs:")?;
+        let after = after.trim_start_matches(|letter: char| letter.is_ascii_digit());
+        Some(format!(
+            "{what}{}",
+            after.strip_prefix('.').unwrap_or(after)
+        ))
+    });
+    origin.unwrap_or_else(|| text.to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::anyhow;
+
+    use super::*;
+
+    #[test]
+    fn causes_are_told_once_and_without_where_they_were_made() {
+        let error = anyhow!("no such port at /root/src/zenoh-link/lib.rs:62.");
+        let error = error.context("Zenoh: no such port at /root/src/zenoh-link/lib.rs:62.; see -l");
+        assert_eq!(explain(&error), "Zenoh: no such port; see -l");
+        let error = anyhow!("not found").context("reading a.txt");
+        assert_eq!(explain(&error), "reading a.txt: not found");
+        let error = anyhow!("cannot look at /a/b.rs: not found");
+        assert_eq!(explain(&error), "cannot look at /a/b.rs: not found");
+    }
+}

@@ -37,6 +37,7 @@ impl SettingsOptions {
             .as_ref()
             .map(|path| {
                 std::fs::read_to_string(path).map_err(|error| ConfigError::Read {
+                    option: "--settings",
                     file: path.display().to_string(),
                     error,
                 })

@@ -67,7 +67,7 @@ struct Prior {
     #[arg(long, value_name = POSE, allow_hyphen_values = true)]
     pose: Numbers<7>,
     /// Of the imagined camera, in pixels.
-    #[arg(long, value_name = LENS)]
+    #[arg(long, value_name = LENS, value_parser = lens)]
     intrinsics: Numbers<6>,
     /// What to show.
     #[arg(long, value_enum, default_value_t = Plane::Expected)]
@@ -94,7 +94,7 @@ struct Evaluate {
     #[arg(long, value_name = POSE, allow_hyphen_values = true)]
     pose: Numbers<7>,
     /// Of the camera that took it, in pixels.
-    #[arg(long, value_name = LENS)]
+    #[arg(long, value_name = LENS, value_parser = lens)]
     intrinsics: Numbers<6>,
 }
 
@@ -109,7 +109,7 @@ struct NextView {
     )]
     candidates: Vec<Numbers<7>>,
     /// Of the imagined camera, in pixels; small ones rank as well.
-    #[arg(long, value_name = LENS)]
+    #[arg(long, value_name = LENS, value_parser = lens)]
     intrinsics: Option<Numbers<6>>,
     /// In place of candidates, a ring around where this robot was last.
     #[arg(long, requires = "camera", conflicts_with = "candidates")]
@@ -178,6 +178,17 @@ impl<const N: usize> FromStr for Numbers<N> {
             .and_then(|numbers| numbers.try_into().ok())
             .map(Self)
             .ok_or_else(|| format!("these must be {N} numbers with commas between them"))
+    }
+}
+
+/// With a size in whole pixels.
+fn lens(text: &str) -> Result<Numbers<6>, String> {
+    let lens: Numbers<6> = text.parse()?;
+    let [.., width, height] = lens.0;
+    if width.fract() == 0.0 && height.fract() == 0.0 {
+        Ok(lens)
+    } else {
+        Err("width and height must be whole numbers".to_owned())
     }
 }
 

@@ -46,6 +46,7 @@ impl Token {
     /// A file that cannot be read, or a token that is too short, too long, or not one word of visible ASCII.
     pub fn read(file: &Path) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(file).map_err(|error| ConfigError::Read {
+            option: "--http-token-file",
             file: file.display().to_string(),
             error,
         })?;

@@ -41,7 +41,7 @@ impl ZenohOptions {
     pub fn config(&self, message_bytes_max: usize) -> Result<Config, ConfigError> {
         let mut config = match &self.config {
             Some(path) => Config::from_file(path)
-                .map_err(|error| ConfigError::Zenoh(format!("{}: {error}", path.display())))?,
+                .map_err(|error| ConfigError::Zenoh(format!("-c {}: {error}", path.display())))?,
             None if std::env::var_os(Config::DEFAULT_CONFIG_PATH_ENV).is_some() => {
                 Config::from_env().map_err(|error| {
                     ConfigError::Zenoh(format!("{}: {error}", Config::DEFAULT_CONFIG_PATH_ENV))

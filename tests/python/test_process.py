@@ -44,7 +44,8 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
     [
         ("forgetting=0.99", ["forgetting", "0.5", "0.9"]),
         ("colour=blue", ["colour", "no setting"]),
-        ("views=many", ["views", "many"]),
+        ("views=many", ["views", "many", "a whole number"]),
+        ("robots.R1.mode=learn", ["R1", "a-z"]),
         ("views", ["views", "name=value"]),
     ],
 )
@@ -55,8 +56,35 @@ def test_a_wrong_setting_exits_64_with_a_sentence(setting, words):
     assert "panicked" not in result.stderr
 
 
+def test_who_reads_no_further_ends_a_command_quietly(own_daemon):
+    with open_session(own_daemon.endpoint) as session:
+        Robot(session, "place").show()
+        command = subprocess.Popen(
+            [BINARY, "query", "status", "--place", "place", "-e", own_daemon.endpoint],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        command.stdout.close()
+        told = command.stderr.read()
+        assert command.wait(DEADLINE_S) == 0 and "status" not in told and "panicked" not in told, told
+
+
+LENS = "300,300,159.5,119.5,320.5,240"
+
+
 @pytest.mark.parametrize(
-    "arguments", [["sing"], ["serve", "--loudly"], ["serve", "--preset", "best"], ["serve", "--http"], []]
+    "arguments",
+    [
+        ["sing"],
+        ["serve", "--loudly"],
+        ["serve", "--preset", "best"],
+        ["serve", "--http"],
+        ["evaluate", "somewhere", "--rig"],
+        ["evaluate", "somewhere", "--ignore-world", "1,two,2,3,4"],
+        ["export", "LAB", "file"],
+        ["query", "status", "--place", "LAB"],
+        ["query", "prior", "--place", "lab", "--pose", "0,0,0,0,0,0,1", "--intrinsics", LENS, "--out", "x.png"],
+        [],
+    ],
 )
 def test_wrong_arguments_exit_2(arguments):
     result = run(*arguments)
