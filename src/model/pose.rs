@@ -39,10 +39,21 @@ pub fn pose_from_parts(position: [f64; 3], quaternion_xyzw: [f64; 4]) -> Option<
 
 /// Angle between the viewing directions (the optical axes) of two cameras, radians.
 pub fn viewing_angle_rad(world_from_a: &Pose, world_from_b: &Pose) -> f64 {
-    let a = world_from_a.rotation * Vector3::z();
-    let b = world_from_b.rotation * Vector3::z();
+    angle_rad(
+        &viewing_direction(world_from_a),
+        &viewing_direction(world_from_b),
+    )
+}
+
+/// The optical axis of a camera, a unit vector in the world.
+pub fn viewing_direction(world_from_camera: &Pose) -> Vector3<f64> {
+    world_from_camera.rotation * Vector3::z()
+}
+
+/// Between two directions, radians.
+pub fn angle_rad(a: &Vector3<f64>, b: &Vector3<f64>) -> f64 {
     // atan2 stays exact for small angles, where acos of the dot product does not.
-    a.cross(&b).norm().atan2(a.dot(&b))
+    a.cross(b).norm().atan2(a.dot(b))
 }
 
 /// View distance D = |c_a - c_b| + `metres_per_radian` * angle of the viewing directions, metres.
