@@ -3,28 +3,26 @@
 //! `taskset -c 1 cargo bench --bench hot_path -- [REPETITIONS] [full]`; `full` adds 640x480, 3 and 15 views, two threads (not
 //! pinned to one core then) and selection among very many viewpoints. `ISA=portable|avx2` chooses instructions. On a Xeon
 //! with AVX-512 (2.6 GHz) and two cores, with real-time priority (`chrt -f 10`), because other work would take the second
-//! core, least of 10 repetitions, milliseconds:
+//! core, least of 60 repetitions, milliseconds:
 //!
 //! ```text
 //!                        320x240   noisy  3 views  15 views  2 threads | 640x480   noisy  3 views  15 views  2 threads
-//! paper, 7 views             6.6     8.1      3.8      13.2       3.9  |    24.4    33.2     13.2      52.7      13.9
-//! robust, one view more      9.2    10.7      6.1      16.8       5.8  |    35.1    45.3     22.9      69.8      19.6
-//! reference (of paper)       163     161        -         -         -  |     643     646        -         -         -
-//! reading (of paper)         2.2     2.1      0.9       4.2         -  |     8.3     8.2      3.2      15.7         -
+//! paper, 7 views             6.6     9.1      3.9      12.7       3.9  |    24.7    36.8     14.1      50.7      14.0
+//! robust, one view more     10.6    12.8      7.1      17.8       6.3  |    38.8    50.9     25.9      67.6      20.9
+//! reference (of paper)       187     188        -         -         -  |     780     785        -         -         -
+//! reading (of paper)         2.5     2.5      0.9       4.5         -  |     9.0     9.2      3.6      18.1         -
 //! ```
 //!
-//! Of the 6.6: recall 4.8, score 0.8, prepare 0.1, observe 0.1; of the 9.2: refine 1.1, recall 6.1, score 1.7, prepare
-//! 0.3. Two threads are 1.70 and 1.58 times as fast as one at 320x240, 1.76 and 1.79 at 640x480 (by the median 1.69, 1.61,
-//! 1.72, 1.73); two processes with one thread each do 1.9 times the work of one, which is the most that can be had here.
-//! Without priority, beside other work, nothing is gained by the median. A pool's thread that sleeps takes 0.04 to 0.08 ms
-//! to take over and hand back.
+//! Of the 6.6: recall 5.2, score 0.8, prepare 0.2, observe 0.1; of the 10.6: refine 1.4, recall 7.1, score 2.0, prepare
+//! 0.4. From 3 to 15 views recall takes 0.93 times as much a pixel and view, the whole frame 0.66 (`robust` 0.62), because
+//! score and refinement do not grow. Two threads are 1.69 times as fast as one at 320x240, both presets, and 1.77 and 1.85
+//! at 640x480 (by the median 1.57, 1.64, 1.79, 1.93). Without priority, beside other work, nothing is gained by the
+//! median. A pool's thread that sleeps takes 0.04 to 0.08 ms to take over and hand back. Seven of 1,000,000 viewpoints are
+//! selected in 0.006 ms, looking at all of them takes 57.
 //!
-//! `peers.py`, likewise, least of 40 (640x480: 16): at 320x240 `paper` 6.7, `robust` 9.6, remap of 70 planes 13.1,
-//! interleaved 5.1, MOG2 2.5, KNN 5.1, NumPy + SciPy 11.5; at 640x480 25.0, 37.3, 50.9, 17.3, 9.5, 20.6, 59.5. Seven of
-//! 1,000,000 viewpoints are selected in 0.006 ms.
-//!
-//! These are of before recall took less: then and now in turns in one process, on a busy machine, least of 60: 6.2 -> 5.6
-//! (`paper`) and 7.5 -> 6.8 (`robust`), and where one thread works alone 2 to 3 % less with longer strips.
+//! `peers.py`, likewise, least of 60 (640x480: 16): at 320x240 `paper` 6.2, `robust` 10.2, remap of 70 planes 13.0,
+//! interleaved 5.7, MOG2 1.9, KNN 4.9, NumPy + SciPy 13.4; at 640x480 23.7, 37.1, 50.2, 18.5, 9.2, 19.1, 65.4. Recall
+//! takes some 19 cycles a pixel and view and is bound by arithmetic: what lies in the second-level cache costs as much.
 //!
 //! How exact it is, as `tests/merge.rs`, `belief.rs` and `storage.rs` print it: from seven views of a smooth scene tau is
 //! 0.0007 grey levels (`robust` 0.001) off the plain mesh's, and 99.98 % of the pixels are seen by as many views; where views
