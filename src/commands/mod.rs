@@ -111,13 +111,11 @@ pub fn explain(error: &anyhow::Error) -> String {
 
 /// Zenoh's errors end with ` at /path/file.rs:line.`
 fn without_origin(text: &str) -> String {
-    let origin = text.split_once(" at /").and_then(|(what, origin)| {
-        let (_, after) = origin.split_once(".rs:")?;
-        let after = after.trim_start_matches(|letter: char| letter.is_ascii_digit());
-        Some(format!(
-            "{what}{}",
-            after.strip_prefix('.').unwrap_or(after)
-        ))
+    let origin = text.rsplit_once(" at /").and_then(|(what, origin)| {
+        let (_, line) = origin.split_once(".rs:")?;
+        let after = line.trim_start_matches(|letter: char| letter.is_ascii_digit());
+        let is_line = after.len() < line.len();
+        is_line.then(|| format!("{what}{}", after.strip_prefix('.').unwrap_or(after)))
     });
     origin.unwrap_or_else(|| text.to_owned())
 }
