@@ -22,7 +22,7 @@
 //!
 //! `peers.py`, likewise, least of 60 (640x480: 16): at 320x240 `paper` 6.2, `robust` 10.2, remap of 70 planes 13.0,
 //! interleaved 5.7, MOG2 1.9, KNN 4.9, NumPy + SciPy 13.4; at 640x480 23.7, 37.1, 50.2, 18.5, 9.2, 19.1, 65.4. Recall
-//! takes some 19 cycles a pixel and view and is bound by arithmetic: what lies in the second-level cache costs as much.
+//! takes 9 ns a pixel and view and is bound by arithmetic: what lies in the second-level cache costs as much.
 //!
 //! How exact it is, as `tests/merge.rs`, `belief.rs` and `storage.rs` print it: from seven views of a smooth scene tau is
 //! 0.0007 grey levels (`robust` 0.001) off the plain mesh's, and 99.98 % of the pixels are seen by as many views; where views
