@@ -257,9 +257,9 @@ impl Desk {
         Ok(())
     }
 
-    /// Whether the service that writes the place reports on this network: then the sender hears from it, and a refusal
+    /// Whether the service that writes the place reports on this camera in this network: then the sender hears from it, and a refusal
     /// beside each report would only confuse.
-    fn writer_answers(&mut self) -> bool {
+    fn writer_answers(&mut self, source: &Source) -> bool {
         if self.writer.is_none() {
             let Worker {
                 session,
@@ -269,13 +269,16 @@ impl Desk {
             } = &self.worker;
             self.writer = Writer::listen(session, root, place).ok();
         }
-        self.writer.as_ref().is_some_and(Writer::is_heard)
+        self.writer
+            .as_ref()
+            .is_some_and(|writer| writer.reports_on(source))
     }
 
     fn refuse(&mut self, source: &Source, leaf: &'static str, refused: Refused) {
         let root = self.worker.root.clone();
-        let is_told =
-            leaf == keys::FRAME && refused.refusal.code == PLACE_HELD && self.writer_answers();
+        let is_told = leaf == keys::FRAME
+            && refused.refusal.code == PLACE_HELD
+            && self.writer_answers(source);
         *self.refused_by.entry(refused.refusal.code).or_default() += 1;
         let Some(camera) = self.camera(source) else {
             return;
